@@ -285,6 +285,8 @@ def _calibrated(run: Run) -> Calibration:
         untold = [size.untold(refined) for size in stated]
         record.findings += [Finding(Ground.SIZE_UNTOLD, words) for words in untold if words]
         of_sizes = moves_of_sizes([size for size, words in zip(stated, untold, strict=True) if not words])
+        stretched = [one for one in problem.stretched.values() if one.is_clear]
+        record.findings += [Finding(Ground.CLOUDS_STRETCHED, str(one)) for one in stretched]
         of_arm = () if found.noise.model is not None else moves_of_arm(refined, run.options)
         for moves in (*({name: of} for name, of in problem.alike_of_sensors.items()), *of_sizes, *of_arm, of_rows):
             refined = refined.with_errors(moves)

@@ -95,6 +95,8 @@ class Ground(StrEnum):
     SIZE_UNCERTAIN = "size_uncertain"
     #: The motion hardly tells the stated size of a target, on which the poses rest.
     SIZE_UNTOLD = "size_untold"
+    #: Clouds of a sensor are longer across its axis than along it: its focal length is wrong.
+    CLOUDS_STRETCHED = "clouds_stretched"
     #: A stated pose fits the measurements badly.
     POSE_UNCERTAIN = "pose_uncertain"
     #: Single images are upside down.
@@ -250,6 +252,10 @@ _ADVICE = {
     Ground.SIZE_UNTOLD: (
         'measure the named target with a caliper, state what it is, and say that it is known: sizes="known" (in a rig '
         "file: sizes: known), or measure it from other distances too"
+    ),
+    Ground.CLOUDS_STRETCHED: (
+        "calibrate the intrinsics of the named 3D camera at this resolution (its focal length in pixels), and make the "
+        "clouds again with them"
     ),
     Ground.POSE_UNCERTAIN: (
         "measure the stated pose again, or state it as uncertain as it is: Problem.add_prior in place of Problem.fix"

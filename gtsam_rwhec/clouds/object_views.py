@@ -25,12 +25,14 @@ from gtsam_rwhec.clouds.registered_views import (
     noise_of_A,
     prepared,
     registered_in_turn,
+    stretch_of,
 )
 from gtsam_rwhec.clouds.registration import Registrations, largest_group
-from gtsam_rwhec.clouds.surfaces import Surface, size_of
+from gtsam_rwhec.clouds.surfaces import Spacing, Surface, size_of
 from gtsam_rwhec.errors import CloudError
 from gtsam_rwhec.geometry.poses import Array, PosesLike, as_transforms
 from gtsam_rwhec.problem.directions import centre_of_slides, shifted_and_turned, with_common_slides
+from gtsam_rwhec.problem.knowledge import Stretch
 from gtsam_rwhec.problem.measurements import Pair
 from gtsam_rwhec.problem.problem import Problem
 
@@ -73,6 +75,8 @@ class SeenObject:
         Deviations of points across faces and across edges, m; of residuals between two views.
     spacing_m : float
         Distance of neighbouring points after thinning.
+    noise_m : float
+        Standard deviation of a point along its ray, m.
     alike_m, alike_rad : float
         What all views are shifted by alike, and turned by about the thing (standard deviations): no residual shows it.
     by_groups : (6, 6)
@@ -90,6 +94,7 @@ class SeenObject:
     is_certified: bool
     sigma_m: Array
     spacing_m: float
+    noise_m: float
     alike_m: float
     alike_rad: float
     by_groups: Array
@@ -124,6 +129,11 @@ class SeenObject:
         )
         off = shifted_and_turned(self.alike_m, self.alike_rad, self.T_sensor_object[used])
         problem.alike[Pair(target, sensor)] = np.hstack([off, self.by_groups])
+        problem.stretched[Pair(target, sensor)] = self.stretch_of(sensor)
+
+    def stretch_of(self, sensor: str) -> Stretch:
+        """How the clouds are stretched, as a sensor's wrong focal length makes them."""
+        return stretch_of(self.registrations, sensor, Spacing(self.spacing_m, 0.0, self.noise_m))
 
 
 def seen_object(clouds: Iterable[Cloud], A: PosesLike, options: ObjectOptions | None = None) -> SeenObject:
@@ -190,6 +200,7 @@ def seen_from(views: Views, few: Sequence[ViewFinding], A: Array, Y: Array) -> S
         is_certified,
         joint.sigma_m,
         spacing_m,
+        views.spacing.noise_m,
         *_alike(float(joint.sigma_m[0]), spacing_m, joint.alike_m, size_of(kept.surfaces)),
         moves,
     )

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass, replace
 from enum import StrEnum
 from itertools import chain, islice
@@ -13,6 +13,7 @@ from rwhec_factors import se3
 
 from gtsam_rwhec.clouds.cloud import Cloud
 from gtsam_rwhec.clouds.first_registration import first_poses
+from gtsam_rwhec.clouds.point_to_plane import ONE_PLACE
 from gtsam_rwhec.clouds.registration import Registrations, aligned, overlapping_pairs, registered
 from gtsam_rwhec.clouds.surfaces import (
     FEWEST_POINTS,
@@ -25,6 +26,7 @@ from gtsam_rwhec.clouds.surfaces import (
     without_border,
 )
 from gtsam_rwhec.errors import CloudError, RwhecWarning
+from gtsam_rwhec.files.terminal_text import rounded
 from gtsam_rwhec.geometry.poses import (
     Array,
     PoseLike,
@@ -34,6 +36,7 @@ from gtsam_rwhec.geometry.poses import (
     one_transform,
     rows_to_transforms,
 )
+from gtsam_rwhec.problem.knowledge import Stretch
 from gtsam_rwhec.problem.problem import Problem
 from gtsam_rwhec.solver.certificate import Status
 from gtsam_rwhec.solver.solution import solve
@@ -50,10 +53,17 @@ STILL = 0.05
 TINY = 1e-12
 #: Registrations that differ from the poses by more than this share of the thing's size are none of this thing.
 CONTRADICTION = 0.15
+#: Clouds of one thing differ in size by less than this factor.
+OTHER_SIZE = 100.0
 #: Poses are the same if they differ by less than this, rad and m.
 SAME = 1e-6
 #: The spacing is taken from this many views.
 SPACED = 9
+#: Noise along rays makes clouds look shorter across the axis: thinned faces are off by so many of its squares over the
+#: distance of points (0 to 0.5, by the thing).
+SHORTER, UNSURE = 0.2, 0.15
+#: And they are off by this share of the distance of points, however little noise they have: 2 um of a real plate.
+NEVER_BELOW = 5e-4
 #: The name of the sensor in problems of motions.
 SENSOR = "sensor"
 
@@ -77,11 +87,18 @@ class ViewFault(StrEnum):
     MOVED = "moved"
     #: Too few of its points are left to tell a pose.
     FEW_POINTS = "few_points"
+    #: It is far larger or smaller than the others: its unit of length is another.
+    OTHER_SIZE = "other_size"
+    #: It is another view's cloud, point by point.
+    SAME = "same"
 
 
 @dataclass(frozen=True)
 class ViewFinding:
-    """A view that is left out, and why (the thing was ``off_m`` elsewhere); ``str()`` is a sentence."""
+    """A view that is left out, and why; ``str()`` is a sentence.
+
+    The thing was ``off_m`` elsewhere, or the view is ``off_m`` large.
+    """
 
     view: int
     name: str
@@ -97,6 +114,15 @@ class ViewFinding:
             )
         if self.fault is ViewFault.FEW_POINTS:
             return f"{self.name} has too few points to tell a pose"
+        if self.fault is ViewFault.OTHER_SIZE:
+            return (
+                f"{self.name} shows a thing of {rounded(self.off_m)} m, a hundred times larger or smaller than in most "
+                "others: its unit of length is another, or it shows nothing"
+            )
+        if self.fault is ViewFault.SAME:
+            return (
+                f"{self.name} has the same points as {', '.join(self.neighbours)}: a cloud was taken at one pose only"
+            )
         return (
             f"{self.name} overlaps no view of the others where its pose puts it (nearest by rotation: "
             f"{', '.join(self.neighbours)}): it sees another side, the thing moved, or the pose is of another view"
@@ -146,6 +172,7 @@ def prepared(clouds: Iterable[Cloud], A: PosesLike, options: ObjectOptions) -> t
     if len(surfaces) != len(transforms):
         raise CloudError(f"{len(surfaces)} clouds and {len(transforms)} poses in A; give one A for each cloud")
     _check_different(surfaces, transforms)
+    few += _strangers(surfaces, transforms, {each.view for each in few})
     at = np.setdiff1d(np.arange(len(surfaces)), [each.view for each in few])
     if len(at) < FEWEST_VIEWS:
         raise CloudError(
@@ -154,6 +181,27 @@ def prepared(clouds: Iterable[Cloud], A: PosesLike, options: ObjectOptions) -> t
         )
     kept = without_border([surfaces[k] for k in at], GATE * spacing.faces_m)
     return Views(at, kept, transforms[at], spacing), few
+
+
+def _strangers(surfaces: Sequence[Surface], A: Array, without: Collection[int]) -> list[ViewFinding]:
+    """Views of another unit, and those that are one cloud: all of them, or all but the first where poses agree."""
+    at = [view for view in range(len(surfaces)) if view not in without]
+    sizes = np.array([surfaces[view].size_m for view in at])
+    ratio = np.maximum(sizes, ONE_PLACE) / np.median(sizes) if at else sizes
+    found = [
+        ViewFinding(view, surfaces[view].name, ViewFault.OTHER_SIZE, size)
+        for view, size, of in zip(at, sizes.tolist(), ratio, strict=True)
+        if not 1.0 / OTHER_SIZE < of < OTHER_SIZE
+    ]
+    alike: dict[bytes, list[int]] = {}
+    for view in at:
+        alike.setdefault(surfaces[view].faces.points.tobytes(), []).append(view)
+    for views in alike.values():
+        is_one_pose = np.abs(se3.logmap(se3.inverse(A[views[:1]]) @ A[views])).max() < SAME
+        for view in views[1:] if is_one_pose else views if len(views) > 1 else []:
+            others = tuple(surfaces[other].name for other in views if other != view)
+            found.append(ViewFinding(view, surfaces[view].name, ViewFault.SAME, 0.0, others))
+    return found
 
 
 def _check_different(surfaces: Sequence[Surface], A: Array) -> None:
@@ -224,6 +272,24 @@ def noise_of_A(pairs: Registrations, Y: Array) -> Array:
         best = np.linalg.eigh(pairs.covariances[:, part, part])[1][:, :, 0]
         result[part] = np.median(np.einsum("ni,ni->n", best, off[:, part]) ** 2)
     return result
+
+
+def stretch_of(pairs: Registrations, sensor: str, spacing: Spacing) -> Stretch:
+    """How clouds are stretched across their z axis, by pairs of views, each of which may have any pose.
+
+    The deviation is that of leaving out a view at a time, and of what noise does to faces. Smoothing changes how round
+    a thing is, as a stretch does (1 % of a ball of 10 cm): smoothed clouds tell nothing.
+    """
+    information, gradient, points = pairs.of_stretch.T
+    kept = np.array([(pairs.i != view) & (pairs.j != view) for view in np.unique((pairs.i, pairs.j))])
+    if spacing.is_noisy or information.sum() <= 0.0 or (kept @ information <= 0.0).any():
+        return Stretch(sensor, 0.0, np.inf)
+    share = -gradient.sum() / information.sum()
+    jackknife = (len(kept) - 1) * ((kept @ gradient) / (kept @ information)).var()
+    by_metre = np.sqrt(points.sum() / information.sum())
+    shorter = by_metre * spacing.noise_m**2 / spacing.faces_m
+    variance = jackknife + (UNSURE * shorter) ** 2 + (NEVER_BELOW * by_metre * spacing.faces_m) ** 2
+    return Stretch(sensor, float(share + SHORTER * shorter), float(np.sqrt(variance)))
 
 
 def _by_motions(pairs: Registrations, of_A: Array) -> tuple[Array, bool]:

@@ -10,7 +10,7 @@ from rwhec_factors import se3
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
-from gtsam_rwhec.clouds.point_to_plane import known, matches, sigmas
+from gtsam_rwhec.clouds.point_to_plane import known, matches, sigmas, told_of_stretch
 from gtsam_rwhec.clouds.surfaces import Surface
 from gtsam_rwhec.files.optional_packages import extra_named
 from gtsam_rwhec.geometry.poses import Array
@@ -51,6 +51,8 @@ class Registrations:
         The same inverted, with a variance of 100 (rad^2, m^2) where it slides.
     overlap : (P,)
         The share of the points of j that lie on i.
+    of_stretch : (P, 3)
+        As `told_of_stretch`.
     """
 
     i: np.ndarray
@@ -60,6 +62,7 @@ class Registrations:
     information: Array
     covariances: Array
     overlap: Array
+    of_stretch: Array
 
     def __len__(self) -> int:
         return len(self.i)
@@ -150,6 +153,7 @@ def registered(
         np.array([t.information for t in tell]).reshape(-1, 6, 6),
         np.array([t.covariance for t in tell]).reshape(-1, 6, 6),
         np.array([m.overlap for m in several]),
+        np.array([told_of_stretch(m, each, sigma_m) for m, each in zip(several, T, strict=True)]).reshape(-1, 3),
     )
 
 

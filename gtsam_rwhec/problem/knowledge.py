@@ -10,7 +10,7 @@ import numpy as np
 
 from gtsam_rwhec.cameras.camera import Camera
 from gtsam_rwhec.errors import FrameError, OptionError, PriorError, ScaleError, TargetError
-from gtsam_rwhec.files.terminal_text import brief
+from gtsam_rwhec.files.terminal_text import brief, rounded
 from gtsam_rwhec.geometry.poses import Array, PoseLike, one_transform
 from gtsam_rwhec.geometry.real_numbers import is_between, is_one_of
 from gtsam_rwhec.problem.corners import check_camera, check_corner_px, same_board
@@ -23,6 +23,30 @@ SMALLEST_SCALE = SMALLEST_WEIGHT
 LARGEST_SCALE = LARGEST_WEIGHT
 #: Two priors on one frame contradict one another when they differ by more than this many standard deviations.
 CONTRADICTION_SIGMAS = 6.0
+#: Clouds are stretched if they are by this share, and by so many deviations. A focal length that is 1 % wrong shows as
+#: 0.7 to 0.95 %.
+STRETCHED, STRETCH_SIGMAS = 0.003, 3.0
+
+
+@dataclass(frozen=True)
+class Stretch:
+    """By which share clouds of a sensor are longer across its z axis than along it, and the share's deviation."""
+
+    sensor: str
+    share: float
+    sigma: float
+
+    @property
+    def is_clear(self) -> bool:
+        """Whether no noise explains it."""
+        return abs(self.share) > max(STRETCHED, STRETCH_SIGMAS * self.sigma)
+
+    def __str__(self) -> str:
+        return (
+            f"the clouds of {self.sensor} are {rounded(100.0 * abs(self.share))} % "
+            f"{'longer' if self.share > 0.0 else 'shorter'} across its z axis than along it (standard deviation "
+            f"{rounded(100.0 * self.sigma)} %), as a wrong focal length makes them"
+        )
 
 
 @dataclass(frozen=True)
@@ -106,6 +130,8 @@ class Knowledge:
         self.boards: dict[str, Array] = {}
         #: Of targets in clouds: what all views are off by alike, in the sensor's axes: (6, k), one deviation a column.
         self.alike: dict[Pair, Array] = {}
+        #: How such clouds are stretched.
+        self.stretched: dict[Pair, Stretch] = {}
         self.corner_px: float | None = None
 
     def fix(self, name: str, T_carrier_frame: PoseLike) -> None:
@@ -195,6 +221,7 @@ class Knowledge:
             if not same_board(self.boards.setdefault(name, board), board):
                 raise TargetError(f"{name} has other board_points in one problem than in the other; rename one of them")
         self.alike |= other.alike
+        self.stretched |= other.stretched
         if other.corner_px is not None:
             self.corner_px = check_corner_px(other.corner_px, self.corner_px, "a problem that is joined")
 
@@ -206,4 +233,5 @@ class Knowledge:
         self.cameras = {name: camera for name, camera in other.cameras.items() if name not in frames}
         self.boards = {name: board for name, board in other.boards.items() if name not in frames}
         self.alike = {pair: of for pair, of in other.alike.items() if not {*pair.frames} & {*frames}}
+        self.stretched = {pair: of for pair, of in other.stretched.items() if not {*pair.frames} & {*frames}}
         self.corner_px = other.corner_px

@@ -158,6 +158,8 @@ class ObjectReport(FileRecord):
         description="how errors that groups of clouds have together move the sensor, one standard deviation each: "
         "three turns, rad, and three shifts, m",
     )
+    stretch_percent: float = Field(default=0.0, description="how much longer clouds are across their z axis, percent")
+    stretch_sigma_percent: float | None = Field(default=None, description="its standard deviation; null: not told")
     registrations: tuple[RegisteredPair, ...] = Field(description="registrations of two clouds")
     remarks: tuple[str, ...] = Field(default=(), description="what is wrong with single clouds, in words")
 

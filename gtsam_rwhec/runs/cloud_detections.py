@@ -233,7 +233,7 @@ def _records(seen: SeenObject, topic: str, frame: str, target: str, stamps_ns: S
 
 
 def _report(seen: SeenObject, target: str, sensor: str, names: Sequence[str]) -> ObjectReport:
-    pairs = seen.registrations
+    pairs, stretch = seen.registrations, seen.stretch_of(sensor)
     # The carriers' poses and the certified pose of the sensor predict each registration.
     T_target_sensor = se3.inverse(seen.A) @ seen.T_sensorcarrier_sensor
     predicted = se3.inverse(T_target_sensor[pairs.i]) @ T_target_sensor[pairs.j]
@@ -253,6 +253,8 @@ def _report(seen: SeenObject, target: str, sensor: str, names: Sequence[str]) ->
         alike_mm=1e3 * seen.alike_m,
         alike_deg=float(np.degrees(seen.alike_rad)),
         by_groups=tuple(map(tuple, seen.by_groups.T.tolist())),
+        stretch_percent=100.0 * stretch.share,
+        stretch_sigma_percent=100.0 * stretch.sigma if np.isfinite(stretch.sigma) else None,
         registrations=tuple(
             RegisteredPair(
                 first=names[i],

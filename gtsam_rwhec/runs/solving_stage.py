@@ -27,6 +27,7 @@ from gtsam_rwhec.fitting.unknowns import Unknown, UnknownKind
 from gtsam_rwhec.geometry.blas_threads import one_blas_thread
 from gtsam_rwhec.logs.mcap_reader import Log, open_log
 from gtsam_rwhec.problem.directions import shifted_and_turned
+from gtsam_rwhec.problem.knowledge import Stretch
 from gtsam_rwhec.problem.measurements import Pair
 from gtsam_rwhec.problem.problem import Problem
 from gtsam_rwhec.problem.selection import selected
@@ -226,6 +227,9 @@ def _solved(log: CleanedLog, progress: Progress | None) -> Calibrated:
         if pair in pairs:
             off = shifted_and_turned(1e-3 * one.alike_mm, np.radians(one.alike_deg), pairs[pair].B)
             problem.alike[pair] = np.column_stack([off, *one.by_groups])
+            if one.stretch_sigma_percent is not None:
+                share, sigma = one.stretch_percent / 100.0, one.stretch_sigma_percent / 100.0
+                problem.stretched[pair] = Stretch(one.sensor, share, sigma)
     try:
         problem = log.corners.in_problem(problem, pairs, log.cameras)
     except CameraError as error:  # a driver's corners outside of its images: the poses have an answer, in doubt

@@ -223,6 +223,15 @@ def test_bad_clouds_are_named_and_the_others_used(folder: Path, made: SimulatedC
     assert mm < 0.6
 
 
+def test_a_folder_of_clouds_by_a_wrong_focal_length_is_named(folder: Path, tmp_path: Path) -> None:
+    wide = tmp_path / "wide"
+    shutil.copytree(folder, wide)
+    for path in (wide / "clouds").iterdir():
+        np.save(path, np.load(path) * np.float32([1.01, 1.01, 1.0]))
+    said = run("calibrate", wide, "--rig", wide / "rig.yaml", "-o", tmp_path / "out", status=0)
+    assert "% longer across its z axis than along it" in " ".join(said.split())
+
+
 def test_depth_images_that_show_nothing_are_named_by_topic_and_stamp() -> None:
     dark = rw.logs.ImageRecord(5, 7, "/depth", "camera", "16UC1", bytes(24), width=4, height=3, step=8)
     log: Any = SimpleNamespace(records=lambda topics: [dark])
