@@ -16,7 +16,7 @@ from gtsam_rwhec.geometry.rounding import UNIT
 from gtsam_rwhec.problem.knowledge import check_name
 from gtsam_rwhec.problem.measurements import GivenMeasurements, LongTranslations, Measurements, Pair, whole_stamps
 from gtsam_rwhec.problem.moment_stack import BACK_ENTRIES, FRONT, FRONT_ENTRIES, MomentStack
-from gtsam_rwhec.problem.moments import BLOCK, ONE, R_A, R_B, T_A, Gauge
+from gtsam_rwhec.problem.moments import BLOCK, ONE, R_A, R_B, T_A, T_B, Gauge
 
 #: This many measurements are summed at once: some megabytes.
 SUMMED_AT_ONCE = 4096
@@ -174,7 +174,7 @@ class Sorted:
         f[T_A] += c[0, :, None] * f[0:3] + c[1, :, None] * f[3:6] + c[2, :, None] * f[6:9] - a[:, :, None]
         f[ONE] = 1.0
         weight, kappa = self._weights(places)
-        result.least_weight[:] = weight.min(axis=1)
+        result.longest_as_summed[:] = np.stack([np.linalg.norm(f[of], axis=0).max(axis=1) for of in (T_A, T_B)], axis=1)
         weight, kappa = weight * valid, kappa * valid
         kept = np.arange(25) if result.back is not None else FRONT
         rows = np.ascontiguousarray(f[kept].transpose(1, 0, 2))  # (p, features, k)

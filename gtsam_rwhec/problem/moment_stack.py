@@ -51,7 +51,7 @@ class MomentStack:
     error_as_summed: Array  #: (E, 3): the feature error of t_A
     operations_as_summed: np.ndarray  #: (E,)
     deviation: Array  #: (E,)
-    least_weight: Array  #: (E,): the least 1 / sigma^2 of a measurement
+    longest_as_summed: Array  #: (E, 2): the longest t_A and t_B of a measurement
     projected: np.ndarray  #: (E,)
     a: Array | None = None
     c: Array | None = None
@@ -72,7 +72,7 @@ class MomentStack:
             error_as_summed=np.zeros((E, 3)),
             operations_as_summed=whole[1],
             deviation=np.zeros(E),
-            least_weight=np.full(E, np.inf),
+            longest_as_summed=np.zeros((E, 2)),
             projected=whole[2],
         )
 
@@ -106,8 +106,8 @@ class MomentStack:
         for name in ("magnitude_as_summed", "error_as_summed"):
             getattr(self, name)[index] = np.hypot(getattr(self, name)[index], getattr(other, name))
         self.operations_as_summed[index] = np.maximum(self.operations_as_summed[index], other.operations_as_summed) + 1
-        self.deviation[index] = np.maximum(self.deviation[index], other.deviation)
-        self.least_weight[index] = np.minimum(self.least_weight[index], other.least_weight)
+        for name in ("deviation", "longest_as_summed"):
+            getattr(self, name)[index] = np.maximum(getattr(self, name)[index], getattr(other, name))
 
     def as_summed(self) -> MomentStack:
         """The same moments, as if they had been summed about the gauge that they are read about."""
@@ -118,7 +118,8 @@ class MomentStack:
             if back is not None:
                 back[at] = G[:, BACK_ENTRIES[0], BACK_ENTRIES[1]]
         whole = replace(self, front=front, back=back, count=self.count.copy(), a=None, c=None)
-        arrays = {"magnitude_as_summed": self.magnitude.copy(), "operations_as_summed": self.operations.copy()}
+        names = ("magnitude", "operations", "longest")
+        arrays = {f"{name}_as_summed": getattr(self, name).copy() for name in names}
         return replace(whole, **arrays)
 
     def one(self, e: int) -> Moments:
@@ -151,6 +152,13 @@ class MomentStack:
     def magnitude(self) -> Array:
         """(E, 25), which bound the rounding."""
         return self._by_shift(self.magnitude_as_summed)
+
+    @property
+    def longest(self) -> Array:
+        """(E, 2): no t_A and no t_B of a measurement is longer."""
+        if self.a is None or self.c is None:
+            return self.longest_as_summed
+        return self.longest_as_summed + np.r_[np.linalg.norm(self.a) + np.linalg.norm(self.c), 0.0]
 
     @cached_property
     def feature_error(self) -> Array:

@@ -13,7 +13,6 @@ from decimal import ROUND_DOWN, Context
 import numpy as np
 
 from gtsam_rwhec.geometry.poses import Array
-from gtsam_rwhec.problem.moments import T_A, T_B
 from gtsam_rwhec.solver.answers import Answer, Point, as_point
 from gtsam_rwhec.solver.parts import Part
 
@@ -76,7 +75,7 @@ def _down(number: float) -> str:
 def extent_of(part: Part, point: Point) -> float:
     """The size of what was measured, in metres, about the gauge: no translation of A, B, X, Y or Y^-1 A X is larger.
 
-    Where the measurements were not kept, it is what their squares allow, also where weights are unequal.
+    Where the measurements were not kept, what the gauge was moved by is added to their lengths.
     """
     moments, scale = part.moments, part.known_scales.copy()
     if part.scale == "shared":
@@ -85,9 +84,7 @@ def extent_of(part: Part, point: Point) -> float:
     reach = np.linalg.norm(point.numbers[:, :3], axis=1).max(initial=0.0)
     largest = [0.0]
     if part.given is None:
-        for features, per in ((T_A, np.ones_like(scale)), (T_B, scale)):
-            square = moments.squares(features) / moments.least_weight
-            largest.append(float((np.sqrt(np.maximum(square, 0.0)) / per).max()))
+        largest += [float(moments.longest[:, 0].max()), float((moments.longest[:, 1] / scale).max())]
     else:
         a = part.gauge.sensor_carrier
         for e, raw in part.given.batches:
