@@ -268,19 +268,17 @@ def _say_drift(run: Run, model: NoiseInData) -> None:
     """Record whether errors of neighbours in time are alike."""
     what, record = "drift", run.record
     if model.is_drift_untried:
-        evidence = "more pairs are measured at the same instants than its model can hold"
+        evidence = model.drift_not_sought or "more pairs are measured at the same instants than its model can hold"
         record.choose(what, "seen, and not modelled; blocks of time widen the standard deviations", evidence)
-        words = (
-            "errors of neighbours in time are alike, and no model holds them; the standard deviations were widened as "
-            "blocks of time show, and may still be too small"
-        )
-        record.find(Ground.CORRELATED, words)
+        widened = "the standard deviations were widened as blocks of time show, and may still be too small"
+        if model.drift_not_sought:
+            widened = "the log is too short for one, and the standard deviations may be too small"
+        record.find(Ground.CORRELATED, f"errors of neighbours in time are alike, and no model holds them; {widened}")
     elif model.correlation is None:
         if run.options.drift == "none":
             record.choose(what, "none", run.says_so)
         elif model.drift_not_sought:
-            # No finding: few instants hardly drift. (Honest ones often have neighbours that are alike by chance, so a
-            # test of that would accuse them.)
+            # No finding: few instants hardly drift, and these have neighbours no more alike than chance makes them.
             record.choose(what, "no model of it was tried", model.drift_not_sought)
         else:
             order = "" if model.has_stamps else " (rows are taken to be in order of time, since they have no stamps)"

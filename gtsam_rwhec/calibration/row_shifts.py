@@ -201,8 +201,8 @@ def between_rows(refined: Refined, measured: Mapping[Pair, Measured]) -> Between
             # Neighbours that are alike count as fewer.
             alike = np.clip((r[1:] * r[:-1]).sum() / max(float((r**2).sum()), 1e-300), 0.0, 0.99)
             evidence = (6 * len(e) - 13) * (less - more) * (1.0 - alike) / (1.0 + alike)
-            sigmas, moved = float(np.sqrt(max(evidence, 0.0))), {pair.target: of_X, pair.sensor: of_Y}
-            found.append(BetweenRows(pair, float(there[12]), is_late, sigmas, moved))
+            s, sigmas = float(there[12]), float(np.sqrt(max(evidence, 0.0)))
+            found.append(BetweenRows(pair, s, is_late, sigmas, {pair.target: of_X, pair.sensor: of_Y}))
     best = max(found, key=lambda one: one.sigmas, default=None)
     return None if best is None else replace(best, chance=len(found) * float(chdtrc(1.0, best.sigmas**2)))
 

@@ -19,6 +19,7 @@ from gtsam_rwhec.fitting.fit_options import CARRIER, DRIFT, SYSTEMATIC, About, C
 from gtsam_rwhec.fitting.joint_covariance import JointCovariance
 from gtsam_rwhec.fitting.lasting_errors import LastingErrors
 from gtsam_rwhec.fitting.noise_search import (
+    CORRELATED,
     MOST_TRACKS,
     Settled,
     Task,
@@ -86,7 +87,7 @@ class NoiseInData:
     drift_not_sought: str
     #: Whether the order in time is known; without stamps it is that of rows.
     has_stamps: bool
-    #: Whether residuals are correlated in time, and there are too many tracks for a model of it.
+    #: Whether residuals are correlated in time, and there are too many tracks for a model of it, or too short ones.
     is_drift_untried: bool
     #: Whether the covariance has a constant error of A, which no residual shows, tied to the part that varies.
     arms_assumed: bool
@@ -325,13 +326,14 @@ def mixed(task: Task, found: Settled, larger: float = 1.0) -> tuple[JointCovaria
 
 
 def is_drift_untried(task: Task, found: Settled) -> bool:
-    """Whether errors of neighbours are alike track by track, and there are too many tracks for a model of that."""
-    if task.instants.chains <= MOST_TRACKS:
+    """Whether errors of neighbours are alike, and tracks are too many for a model of that, or few and too short."""
+    is_few = task.instants.chains <= MOST_TRACKS
+    if is_few and not (task.options.drift != "none" and why_no_drift(task)):
         return False
     eliminated = found.model.eliminated(found.fit.sizes.values(found.fit.logs))
     left = eliminated.left(eliminated.measured.of.columns)
     tracks = [left[task.instants.chain == chain] for chain in range(task.instants.chains)]
-    return likeness_of_neighbours(tracks) > SURELY_CORRELATED
+    return likeness_of_neighbours(tracks) > (CORRELATED if is_few else SURELY_CORRELATED)
 
 
 def is_no_arm(task: Task) -> bool:

@@ -86,6 +86,14 @@ def test_a_drift_whose_own_optimum_is_worse_is_not_taken(monkeypatch: pytest.Mon
     assert refined_under(simulated(walk=(0.003, 0.002)))[1].correlation is None
 
 
+@pytest.mark.parametrize("walk", [(0.003, 0.002), (0.0, 0.0)])
+def test_a_short_log_whose_errors_drift_asks_for_care(walk: tuple[float, float]) -> None:
+    """Of 19 stations of a drifting odometry the map was USE at chi2 62: a model of drift takes 20."""
+    judgement = rw.calibrate(simulated(18, walk=walk)).judgement
+    assert (rw.Ground.CORRELATED in judgement.grounds) is (walk[0] > 0.0)
+    assert ("the log is too short" in judgement.reason) is (walk[0] > 0.0)
+
+
 def test_a_scale_that_runs_away_under_the_noise_is_not_told() -> None:
     """A camera turns and hardly moves, and its odometry drifts: the scale fell to 2e-5; it was 1e-11 on another log."""
     chance = np.random.default_rng(4)
