@@ -37,13 +37,13 @@ BUDGET = {
     # a LiDAR beside poses of a vehicle 20; many tags by what does not change 90
     # clouds by a wrong focal length 110, in another unit or given twice 50
     # errors that last 30; an arm's stated accuracy 80; poses logged late, copies, mounts that slipped 200; LiDARs 20
-    "lines": 102_007,
-    "code": 63_605,
+    "lines": 102_008,
+    "code": 63_606,
     # capture has 25 files, and is a package of its own
     "files": 442,
     "packages": 20,
     "names that occur twice": 0,
-    "lines of tests and benchmarks": 73_410,
+    "lines of tests and benchmarks": 73_412,
 }
 NO_CODE = {tokenize.COMMENT, tokenize.NL, tokenize.NEWLINE, tokenize.INDENT, tokenize.DEDENT, tokenize.ENDMARKER}
 
