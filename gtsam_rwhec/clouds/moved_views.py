@@ -61,7 +61,9 @@ def move_of(poses: Array, predicted: Array, covariances: Array, units: Array, si
         solved, after, left = _fitted(np.hstack([base, own]), residuals, int(is_told.sum()))
         if left > 0 and free > left and after > 0.0:
             chance = float(fdtrc(free - left, left, (before - after) / (free - left) / (after / left)))
-            far = float(np.linalg.norm(solved[15:]))
+            # As views see it: along what slides, noise of the axes makes moves of any length.
+            seen = vectors @ (own @ solved[12:]).reshape(-1, 6, 1)
+            far = float(np.sqrt((seen[mask, 3:] ** 2).sum() / mask.sum()))
             if chance < least and far > max(FAR * np.sqrt(3.0 * after / left), LARGE * size_m):
                 best, least = Move(first, stays, far), chance
     return best

@@ -147,11 +147,12 @@ def cloud_of_depth(image: ImageRecord, camera: Camera, unit_m: float | None = No
     CloudError
         The image cannot be decoded, has another size than the intrinsics are for, or shows no depth.
     """
-    where = source or f"topic {image.topic}, image at {image.stamp_ns} ns"
+    stamped = f"topic {image.topic}, image at {image.stamp_ns} ns"
+    where = source or stamped
     try:
         depth = decode_depth(image, (camera.width, camera.height))
     except ImageError as error:
-        raise CloudError(str(error)) from error
+        raise CloudError(str(error).replace(stamped, where)) from error
     if unit_m is None:
         unit_m = METRE if np.issubdtype(depth.dtype, np.floating) else MILLIMETRE
     rows, columns = np.nonzero(np.isfinite(depth) & (depth > 0))

@@ -158,7 +158,8 @@ class MomentStack:
         """(E, 2): no t_A and no t_B of a measurement is longer."""
         if self.a is None or self.c is None:
             return self.longest_as_summed
-        return self.longest_as_summed + np.r_[np.linalg.norm(self.a) + np.linalg.norm(self.c), 0.0]
+        moved = float(np.linalg.norm(self.a) + np.linalg.norm(self.c))
+        return np.asarray(self.longest_as_summed + np.array([moved, 0.0]))
 
     @cached_property
     def feature_error(self) -> Array:

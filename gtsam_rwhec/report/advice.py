@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from gtsam_rwhec.calibration.verdict import Ground, Judgement
-from gtsam_rwhec.files.terminal_text import natural_key, some
+from gtsam_rwhec.files.terminal_text import counted, natural_key, some
 from gtsam_rwhec.results.log_history import LogFields
 from gtsam_rwhec.solver.certificate import Basis, Certificate, Status
 from gtsam_rwhec.solver.free_directions import FreeDirection, FreeReason
@@ -68,8 +68,8 @@ def log_advice(log: LogFields, judgement: Judgement | None = None) -> list[str]:
     """What is odd about a log or its rig file, and what to do about it, without the sizes that a judgement names."""
     of_clouds = {each.sensor for each in log.detection.objects}
     advice = [
-        f"{len(faults)} {'clouds' if sensor in of_clouds else 'images'} of {sensor} could not be used. The first: "
-        f"{faults[0]}"
+        f"{counted(len(faults), 'cloud' if sensor in of_clouds else 'image')} of {sensor} could not be used. "
+        f"The first: {faults[0]}"
         for sensor, faults in log.detection.undecoded.items()
         if faults
     ]

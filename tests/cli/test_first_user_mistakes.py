@@ -302,7 +302,7 @@ def test_one_bad_image_costs_one_image_and_is_named(cell: Path, tmp_path: Path) 
     run = ("calibrate", folder, "--rig", tmp_path / "rig.yaml", "--verbose", "-o", tmp_path / "out")
     status, said = command(*run)
     assert status == 0, said
-    assert "1 images of left could not be used. The first: left/image/0003.png" in said
+    assert "1 image of left could not be used. The first: left/image/0003.png" in said
     assert "of board-left), because they are farther off than the noise of the others explains" in said
 
     # And what is there is not replaced, unless that is said.

@@ -20,6 +20,8 @@ from scipy.spatial.transform import Rotation
 
 import gtsam_rwhec as rw
 from gtsam_rwhec.clouds import seen_object
+from gtsam_rwhec.clouds.named_fields import cloud_of_depth
+from gtsam_rwhec.errors import CloudError
 from gtsam_rwhec.files.progress import silent
 from gtsam_rwhec.rig.cloud_proposal import propose_cloud_rig
 from gtsam_rwhec.rig.folder_contents import cloud_folders
@@ -238,6 +240,9 @@ def test_depth_images_that_show_nothing_are_named_by_topic_and_stamp() -> None:
     camera = rw.Camera.of(4, 3, "pinhole", np.diag([4.0, 4.0, 1.0]), np.zeros(0), "camera")
     ((_, error),) = cloud_detections._Source(log, "/depth", camera, None, {}).each()
     assert str(error).startswith("topic /depth, image at 7 ns: of 12 points none is seen")
+    other = rw.Camera.of(8, 6, "pinhole", np.diag([4.0, 4.0, 1.0]), np.zeros(0), "camera")
+    with pytest.raises(CloudError, match=r"^depth/3\.png: 4 x 3 pixels, but the intrinsics are for 8 x 6"):
+        cloud_of_depth(dark, other, source="depth/3.png")  # an image of a folder has a name
 
 
 @pytest.mark.parametrize(
