@@ -307,9 +307,8 @@ def drawn_board(
     if len(dark) > MOST_PARTS:
         dark = [dark[i] for i in np.linspace(0, len(dark) - 1, MOST_PARTS).round().astype(int).tolist()]
     reach = float(np.linalg.norm(target.corners(), axis=1).max())
-    warp = (
-        np.zeros(len(WARPS)) if isinstance(target, Bundle) else _warp(shape)
-    )  # a bundle's tags are in no common plane
+    # A bundle's tags are in no common plane.
+    warp = np.zeros(len(WARPS)) if isinstance(target, Bundle) else _warp(shape)
     bent = [_bent(polygon / scale, reach / scale, warp) for polygon in dark]
     if len(paper):
         low = min((float(polygon[:, 2].min()) for polygon in bent), default=0.0)
