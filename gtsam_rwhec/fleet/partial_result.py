@@ -59,14 +59,6 @@ class LogFacts(BaseModel):
         return Camera.of(**self.cameras[sensor], where=f"{self.url}: {sensor}")
 
 
-def camera_fields(camera: Camera) -> dict[str, Any]:
-    """What `LogFacts.camera` reads."""
-    return {
-        "width": camera.width, "height": camera.height, "model": camera.model, "K": camera.K.tolist(),
-        "D": camera.D.tolist(),
-    }  # fmt: skip
-
-
 @dataclass(frozen=True, eq=False)
 class PairMeasurements:
     """The cleaned measurements of one pair of a log."""

@@ -142,7 +142,7 @@ def _from_topic(log: Log, topic: str, sensor: str) -> Camera:
             raise CameraError(f"sensor {sensor}: topic {topic} has no intrinsics but {type(record).__name__}s")
         camera = Camera.of(record.width, record.height, record.model, record.K, record.D, f"topic {topic}")
         first = first or camera
-        if _numbers(camera) != _numbers(first):
+        if camera.numbers != first.numbers:
             raise CameraError(
                 f"sensor {sensor}, topic {topic}: intrinsics change at {record.stamp_ns} ns (K from "
                 f"{first.K.tolist()} to {camera.K.tolist()}). After a change of zoom or resolution a camera counts as "
@@ -164,11 +164,6 @@ def _warn_of_a_fold(camera: Camera, sensor: str) -> None:
             CameraWarning,
             stacklevel=3,
         )
-
-
-def _numbers(camera: Camera) -> tuple[object, ...]:
-    """All that two cameras share if they are the same to the last digit."""
-    return camera.width, camera.height, camera.model, camera.K.tolist(), camera.D.tolist()
 
 
 #: This many of a sensor's images are searched at first, and this many times as many if they show too few boards.
