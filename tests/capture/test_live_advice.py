@@ -8,7 +8,7 @@ from synthetic_logs import rig
 import gtsam_rwhec as rw
 from gtsam_rwhec.cameras.camera import Camera
 from gtsam_rwhec.capture import Accuracy, StoppingRule
-from gtsam_rwhec.capture.live_advice import next_pose, stop_decision
+from gtsam_rwhec.capture.live_answer import next_pose, stop_decision
 
 CAMERA = Camera.of(640, 480, "plumb_bob", [[500, 0, 320], [0, 500, 240], [0, 0, 1]], [], "")
 
