@@ -20,7 +20,7 @@ from gtsam_rwhec.rig.odometry_sections import odometry_topic
 from gtsam_rwhec.runs.carrier_motion import read_carrier_motion
 from gtsam_rwhec.runs.image_pictures import draw_images, has_images, write_contact_sheet
 from gtsam_rwhec.runs.kept_detections import KeptDetections, KeptOfLog
-from gtsam_rwhec.runs.odometry_tracks import records_of_files
+from gtsam_rwhec.runs.odometry_motions import records_of_files
 from gtsam_rwhec.runs.output_folder import check_is_not_read, check_writable
 from gtsam_rwhec.runs.recorded_logs import check_is_no_other_folder, is_folder_of_images, write_folder_log
 from gtsam_rwhec.runs.run_log import RECORDED_LOG, LogMetadata, RunLog, image_names, write_run_log
