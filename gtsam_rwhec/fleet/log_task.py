@@ -57,12 +57,8 @@ class LogTask:
 def map_log(task: LogTask, output: str) -> Receipt:
     """Read a log, detect, clean, and write its measurements to the output (a folder or a URL).
 
-    Raises
-    ------
-    RwhecError
-        As ``detect_log`` and ``clean_log`` do; or the log changed while it was read.
-    OSError
-        The store broke off.
+    Raises `RwhecError` as ``detect_log`` and ``clean_log`` do, or if the log changed while it was read; `OSError` if
+    the store broke off.
     """
     return filed(output, task.key, task.file, lambda folder: _partial(task, folder).packed())
 

@@ -183,16 +183,10 @@ def with_sensor_names(facts: LogFacts, names: Mapping[str, str]) -> LogFacts:
 def history_of_logs(
     logs: Sequence[LogFacts], carriers: tuple[str, str], outliers: Mapping[Pair, tuple[int, int]]
 ) -> LogFields:
-    """The histories of all logs of a unit joined into one, in the form of a result file.
+    """The histories of all logs of a unit (one at least) joined into one, in the form of a result file.
 
-    Parameters
-    ----------
-    logs : sequence of LogFacts
-        At least one; with the sensors' names in the unit.
-    carriers : (str, str)
-        Of the sensors, and of the targets.
-    outliers : dict of Pair to (int, int)
-        For each pair in the answer: how many measurements are used, and how many there were.
+    The logs have the sensors' names in the unit; ``carriers`` are those of the sensors and of the targets. ``outliers``
+    has for each pair in the answer how many measurements are used, and how many there were.
     """
     detections, cleanings = [log.detection for log in logs], [log.cleaning for log in logs]
     offsets: dict[str, list[float]] = {}

@@ -99,13 +99,8 @@ def joint_form(
 ) -> JointForm:
     """The form with the windows' rotations and translations fixed to those of ``state.motion``.
 
-    Parameters
-    ----------
-    variances : (m, 2) array
-        Variances of rotation (rad^2/s) and translation (m^2/s).
-    scaled : (m,) booleans
-    prior_rows : (q, d) array, optional
-        Whitened rows over y, from the user's prior knowledge.
+    ``variances`` (m, 2) are of rotation (rad^2/s) and translation (m^2/s), ``scaled`` (m,) booleans, and ``prior_rows``
+    (q, d) whitened rows over y, from the user's prior knowledge.
     """
     m, n = windows.used.shape
     K = m - 1

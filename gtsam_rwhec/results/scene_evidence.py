@@ -87,16 +87,8 @@ def scene_of(
 ) -> SceneEvidence | None:
     """What is needed to draw a rig; None where it has no poses, or nothing was measured.
 
-    Parameters
-    ----------
-    calibration : Calibration
-    rows : dict of Pair to MeasuredRows
-    carriers : (str or None, str or None)
-        Names of the carriers of the sensors and of the targets.
-    cameras : dict of str to Camera
-        Stated intrinsics; those that were estimated come first.
-    targets : dict of str to Target or (n, 3) array
-        As stated: what a target is, or its corners in metres.
+    ``carriers`` are the names of those of the sensors and of the targets. ``cameras`` are stated intrinsics; those that
+    were estimated come first. ``targets`` has as stated what a target is, or its corners (n, 3) in metres.
     """
     used = {
         pair: one
@@ -289,18 +281,9 @@ class DrawnBoard(FileRecord):
 def drawn_board(
     target: Target, scale: float = 1.0, shape: BoardShape | None = None, *, is_one_of_many: bool = False
 ) -> DrawnBoard:
-    """A target as it is drawn.
+    """A target as it is drawn; of one of many the modules of its tags are left out.
 
-    Parameters
-    ----------
-    target : Target
-        As the rig file states it.
-    scale : float
-        Its stated size over the true one.
-    shape : BoardShape, optional
-        Its warp, where it was estimated.
-    is_one_of_many : bool
-        The modules of its tags are left out.
+    ``scale`` is its stated size over the true one, ``shape`` its warp, where it was estimated.
     """
     has_modules = not is_one_of_many and len(target.ids) <= WITH_MODULES
     paper, dark = _parts(target, has_modules)

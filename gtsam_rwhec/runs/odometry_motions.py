@@ -270,12 +270,7 @@ FEWEST_USED = 3
 def odometry_pairs(log: Log, rig: Rig, sensor: str, motion: CarrierMotion) -> tuple[MeasuredPairs, float, float | None]:
     """The motions of an odometry and the carriers (A Y = Y B), the time offset, and its deviation if estimated.
 
-    Raises
-    ------
-    StampError
-        The motion does not determine the time offset.
-    LogError
-        No window is left.
+    Raises `StampError` if the motion does not determine the time offset, `LogError` if no window is left.
     """
     track = read_odometry(log, rig, sensor)
     section = rig.odometries[sensor]
