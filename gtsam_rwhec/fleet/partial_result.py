@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, ValidationError
+from rwhec_factors.se3 import pose
 
 from gtsam_rwhec.calibration.verdict import Finding, Ground
 from gtsam_rwhec.cameras.camera import Camera
@@ -138,9 +139,8 @@ def _pair(arrays: Mapping[str, np.ndarray], i: int) -> PairMeasurements:
 
 
 def _poses(rows: Array) -> Array:
-    T = np.tile(np.eye(4), (len(rows), 1, 1))
-    T[:, :3] = rows.reshape(-1, 3, 4)
-    return T
+    T = rows.reshape(-1, 3, 4)
+    return pose(T[..., :3], T[..., 3])
 
 
 def with_sensor_names(facts: LogFacts, names: Mapping[str, str]) -> LogFacts:
