@@ -31,6 +31,7 @@ from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.logs import ImageRecord, IntrinsicsRecord, Log
 from gtsam_rwhec.logs.records import INTRINSICS_SCHEMAS
 from gtsam_rwhec.rig import Rig
+from gtsam_rwhec.rig.guessed_boards import usual_lens
 from gtsam_rwhec.rig.sections import Intrinsics
 from gtsam_rwhec.runs.carrier_motion import CarrierMotion
 from gtsam_rwhec.runs.image_pictures import write_contact_sheet
@@ -170,8 +171,6 @@ def _warn_of_a_fold(camera: Camera, sensor: str) -> None:
 FIRST, TIMES = 16, 4
 #: With fewer views than this, the first camera also uses those that were rejected because distortion bends them.
 FEW = 6
-#: The focal length of a usual lens over the width.
-USUAL = 0.87
 #: These rejections depend on poses, and so on intrinsics.
 ABOUT_POSES = (Rejection.NO_POSE, Rejection.REPROJECTION, Rejection.GRAZING)
 
@@ -256,7 +255,7 @@ def _of_images(
 ) -> EstimatedIntrinsics | NotEstimated:
     """Search some images with a pinhole; while boards are few, search more with a camera from the boards so far."""
     total = message_count(log, topic)
-    camera = pinhole = _camera(size)
+    camera = pinhole = usual_lens(size).camera
     found: dict[int, DetectedImage] = {}
     searched: set[int] = set()
 
@@ -356,10 +355,3 @@ def _without_poses(image: DetectedImage) -> DetectedImage:
     if image.found is None:
         return image
     return replace(image, found=replace(image.found, detections=tuple(map(plain, image.found.detections))))
-
-
-def _camera(size: Size) -> Camera:
-    """A pinhole of a usual focal length whose axis is in the middle of the image."""
-    width, height = size
-    K = [[USUAL * width, 0.0, 0.5 * (width - 1)], [0.0, USUAL * width, 0.5 * (height - 1)], [0.0, 0.0, 1.0]]
-    return Camera.of(width, height, "pinhole", K, (), "in place of the camera")
