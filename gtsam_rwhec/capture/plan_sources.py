@@ -186,7 +186,7 @@ def _share(cell: Cell, problem: Problem) -> float:
 def _usual_noise(problem: Problem, pair: Pair) -> Array:
     """The standard deviations (2,) of a usual measurement, rad and m."""
     variances = np.einsum("nii->ni", problem.measurements(*pair).covariance_of_B()).reshape(-1, 2, 3).mean(axis=2)
-    return np.sqrt(np.median(variances, axis=0))
+    return np.asarray(np.sqrt(np.median(variances, axis=0)))
 
 
 def _poses(problem: Problem | None) -> Array:
@@ -251,10 +251,9 @@ def _of_problem(problem: Problem, kit: Kit, options: PlanOptions) -> Cell:
         problem = stated
     is_nominal = False
     if not X and kit.boards and sensors and sensors[0] in kit.cameras:
-        name, present = next(iter(kit.boards)), np.eye(4)
-        if options.present is not None:
-            present = one_transform(options.present, "PlanOptions.present")
-        is_nominal = True
+        name, is_nominal = next(iter(kit.boards)), True
+        given = options.present
+        present = np.eye(4) if given is None else one_transform(given, "PlanOptions.present")
         X = {name: se3.inverse(present) @ Y[sensors[0]] @ in_front(kit.cameras[sensors[0]], kit.boards[name])}
     sizes = {name: 6 for name in (*X, *Y) if name not in problem.fixed}
     if problem.scale != "known":

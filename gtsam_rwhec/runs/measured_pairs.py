@@ -243,7 +243,7 @@ def problem_of(
                 "without a covariance; give rotation_deg and translation_mm, or estimate"
             )
         try:
-            problem.add(*pair, A, B, directional=is_of_clouds, **given, **weights)
+            problem.add(pair.target, pair.sensor, A, B, directional=is_of_clouds, **given, **weights)
         except NoiseError as error:
             raise NoiseError(
                 f"{error}. The covariances are the log's; to replace them, give noise: {{rotation_deg: ..., "
