@@ -26,10 +26,11 @@ from gtsam_rwhec.cameras.targets import (
     square,
 )
 from gtsam_rwhec.files.optional_packages import extra_named
-from gtsam_rwhec.fitting.reprojection_record import WARPS, BoardShape
+from gtsam_rwhec.fitting.reprojection_record import BoardShape
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.problem.measurements import Pair
 from gtsam_rwhec.results.file_record import Count, FileRecord, Rows
+from gtsam_rwhec.results.image_errors import warp_of
 from gtsam_rwhec.results.linear_model import MeasuredRows
 
 #: The path is thinned to this many poses.
@@ -291,7 +292,7 @@ def drawn_board(
         dark = [dark[i] for i in np.linspace(0, len(dark) - 1, MOST_PARTS).round().astype(int).tolist()]
     reach = float(np.linalg.norm(target.corners(), axis=1).max())
     # A bundle's tags are in no common plane.
-    warp = np.zeros(len(WARPS)) if isinstance(target, Bundle) else _warp(shape)
+    warp = warp_of(None if isinstance(target, Bundle) else shape)
     bent = [_bent(polygon / scale, reach / scale, warp) for polygon in dark]
     if len(paper):
         low = min((float(polygon[:, 2].min()) for polygon in bent), default=0.0)
@@ -384,12 +385,6 @@ def _around(points: Array, share: float) -> Array:
 def _circle() -> Array:
     turn = np.linspace(0.0, 2.0 * np.pi, CIRCLE, endpoint=False)
     return np.stack([np.cos(turn), np.sin(turn), np.zeros(CIRCLE)], axis=1)
-
-
-def _warp(shape: BoardShape | None) -> Array:
-    """Heights (3,) of the edge over the middle along x, y and the diagonals, metres."""
-    found = {} if shape is None else dict(zip(shape.names, shape.values, strict=True))
-    return np.array([found.get(name, 0.0) for name in WARPS.values()])
 
 
 def _bent(points: Array, reach: float, warp: Array) -> Array:
