@@ -15,7 +15,7 @@ import os
 import re
 import struct
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager
+from contextlib import AbstractContextManager, ExitStack, contextmanager
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Literal
@@ -75,7 +75,7 @@ POINT_CLOUD = "\n".join(
 ).encode()
 
 
-class LogWriter:
+class LogWriter(AbstractContextManager["LogWriter"]):
     """A context manager that writes one MCAP file. A file of this name is replaced when the block ends without an
     error.
 
@@ -91,9 +91,6 @@ class LogWriter:
             self._writer = McapWriter(on_error.enter_context(self._file), compression=CompressionType.ZSTD)
             self._writer.start(profile="", library="gtsam-rwhec")
             on_error.pop_all()  # __exit__ closes the file
-
-    def __enter__(self) -> LogWriter:
-        return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
