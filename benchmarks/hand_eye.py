@@ -19,7 +19,6 @@ least squares that is let run reaches DQOpt's cost from every start. The paper's
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass
 
 import cv2
 import numpy as np
@@ -27,6 +26,7 @@ from bars import Row, in_words, interleaved, run_script
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
+from simulated import Simulated, pair, poses
 
 import gtsam_rwhec as rw
 
@@ -54,31 +54,7 @@ COUNT = 100
 EVALUATIONS = 5
 
 
-@dataclass(frozen=True)
-class Recording:
-    """Motions C, H (N, 4, 4) and the true X (4, 4)."""
-
-    C: Array
-    H: Array
-    X: Array
-
-
-def poses(rotvecs: Array, translations: Array) -> Array:
-    """Rotation vectors (rad) and translations (m) as (N, 4, 4)."""
-    T = np.zeros((len(rotvecs), 4, 4))
-    T[:, :3, :3] = Rotation.from_rotvec(rotvecs).as_matrix()
-    T[:, :3, 3], T[:, 3, 3] = translations, 1.0
-    return T
-
-
-def noisy(T: Array, rng: np.random.Generator, sigma_rad: float, sigma_m: float) -> Array:
-    """Eq. 38: a small pose on the right of each."""
-    axes = rng.normal(size=(len(T), 3))
-    axes /= np.linalg.norm(axes, axis=1)[:, None]
-    return T @ poses(axes * rng.normal(0.0, sigma_rad, (len(T), 1)), rng.normal(0.0, sigma_m, (len(T), 3)))
-
-
-def recording(motion: str, rng: np.random.Generator) -> Recording:
+def recording(motion: str, rng: np.random.Generator) -> Simulated:
     """Motions of 0.2 s: up to 11.5 deg and 10 cm, as the paper's filter lets through (Appendix D.1)."""
     turn, move = rng.normal(0.0, 0.06, (COUNT, 3)), rng.normal(0.0, 0.03, (COUNT, 3))
     if motion != "hand-held":
@@ -89,8 +65,7 @@ def recording(motion: str, rng: np.random.Generator) -> Recording:
         move = np.column_stack([forward + 0.3 * move[:, 0], 0.2 * move[:, 1], 0.05 * move[:, 2]])
     X = poses(np.radians([[2.35, -0.92, -48.93]]), np.array([[-0.007, 0.281, -0.001]]))[0]
     H = poses(turn, move)
-    sigma_rad, sigma_m = np.radians(0.57), 0.007
-    return Recording(noisy(X @ H @ np.linalg.inv(X), rng, sigma_rad, sigma_m), noisy(H, rng, sigma_rad, sigma_m), X)
+    return pair(H, rng, np.radians(0.57), 0.007, X)
 
 
 def product(q: Array, p: Array) -> Array:
@@ -106,7 +81,7 @@ def dual_quaternions(T: Array) -> tuple[Array, Array]:
     return q, 0.5 * product(t, q)
 
 
-def residuals(r: Recording, X: Array, alpha: float) -> Array:
+def residuals(r: Simulated, X: Array, alpha: float) -> Array:
     """The residuals of eq. 8, from the equations (5) themselves."""
     (q_C, dual_C), (q_H, dual_H), (q, dual) = dual_quaternions(r.C), dual_quaternions(r.H), dual_quaternions(X)
     rotation = product(q_C, q) - product(q, q_H)
@@ -114,12 +89,12 @@ def residuals(r: Recording, X: Array, alpha: float) -> Array:
     return np.concatenate([rotation, alpha * translation]).ravel()
 
 
-def cost_8(r: Recording, X: Array, alpha: float) -> float:
+def cost_8(r: Simulated, X: Array, alpha: float) -> float:
     """Eq. 8."""
     return float((residuals(r, X, alpha) ** 2).sum())
 
 
-def stopped_early(r: Recording, alpha: float, rng: np.random.Generator) -> float:
+def stopped_early(r: Simulated, alpha: float, rng: np.random.Generator) -> float:
     """Cost of SciPy's least squares (rotation vector, translation) from a random pose, after five evaluations."""
     start = np.concatenate([Rotation.random(random_state=rng).as_rotvec(), rng.normal(size=3)])
     return 2.0 * float(

@@ -24,7 +24,7 @@ import tempfile
 import threading
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import AbstractContextManager, contextmanager, suppress
 from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
@@ -90,7 +90,7 @@ def running_robot() -> Iterator[tuple[int, Connection]]:
         process.join()
 
 
-class Command:
+class Command(AbstractContextManager["Command"]):
     """``gtsam-rwhec live`` as a process of its own, with the address of its page."""
 
     def __init__(self, source: str, out: Path, *options: str, rig: Path = RIG, most_bytes: int | None = None) -> None:
@@ -122,9 +122,6 @@ class Command:
         with suppress(ProcessLookupError):
             os.killpg(self.process.pid, signal.SIGKILL)
         self.process.wait()
-
-    def __enter__(self) -> Command:
-        return self
 
     def __exit__(self, *raised: object) -> None:
         self.kill()

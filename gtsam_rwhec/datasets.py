@@ -164,10 +164,7 @@ LOG, RIG, TRUTH = "robot_cell.mcap", "rig.yaml", "truth.json"
 def demo_folder() -> Path:
     """The folder of the shipped log: inside the package when installed from a wheel, ``data/cell`` in a checkout.
 
-    Raises
-    ------
-    FileFormatError
-        When neither folder is there.
+    Raises `FileFormatError` if neither is there.
     """
     package = Path(str(files("gtsam_rwhec")))
     candidates = (package / "demo_data", package.parent / "data" / "cell")

@@ -84,24 +84,24 @@ def test_a_problem_that_cannot_be_solved_is_refused(case: str, call: Callable[[r
         call(problem)
 
 
-@pytest.mark.parametrize("scale", ["shared", "per_target"])
-def test_a_negative_scale_at_the_optimum_is_an_error(scale: Any) -> None:
-    """Lengths of the wrong sign: the best scale is -1, and no answer is returned."""
+NEGATIVE = r"the scale.* is -(1|0\.99999).* at the optimum.*frame convention"
+
+
+@pytest.mark.parametrize(
+    ("scale", "factor", "words"),
+    [
+        ("shared", -1.0, NEGATIVE),
+        ("per_target", -1.0, NEGATIVE),
+        ("shared", 0.0, r"the scale is -?[0-9.e-]+ at the optimum"),
+    ],
+)
+def test_a_scale_that_is_not_positive_at_the_optimum_is_an_error(scale: Any, factor: float, words: str) -> None:
+    """Lengths of the wrong sign, or a sensor that measures none: the best scale is -1 or 0, and there is no answer."""
     problem = rw.Problem(scale)
-    mirrored_B = B.copy()
-    mirrored_B[:, :3, 3] *= -1.0
-    problem.add("tag0", "cam0", A, mirrored_B, 0.01, 100.0)
-    with pytest.raises(ScaleError, match=r"the scale.* is -(1|0\.99999).* at the optimum.*frame convention"):
-        rw.solve(problem)
-
-
-def test_a_scale_of_zero_at_the_optimum_is_an_error() -> None:
-    """A sensor that measures no lengths at all."""
-    problem = rw.Problem("shared")
-    flat = B.copy()
-    flat[:, :3, 3] = 0.0
-    problem.add("tag0", "cam0", A, flat, 0.01, 100.0)
-    with pytest.raises(ScaleError, match=r"the scale is -?[0-9.e-]+ at the optimum"):
+    wrong = B.copy()
+    wrong[:, :3, 3] *= factor
+    problem.add("tag0", "cam0", A, wrong, 0.01, 100.0)
+    with pytest.raises(ScaleError, match=words):
         rw.solve(problem)
 
 

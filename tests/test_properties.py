@@ -329,6 +329,18 @@ def test_a_world_far_away_changes_nothing(mode: str, distance: str, side: str, h
     assert_as_if_near(problem, distance, side, BATCHES[how])
 
 
+def driving_after_rest(of_rest: Noise | None) -> rw.Problem:
+    """Sixty poses of a drive after three thousand of its first one, which have noise of their own or none."""
+    simulation = general(1, 1, seed=2, number_of_measurements=60)
+    driving = simulation.problem.measurements("target0", "sensor0").A
+    generator, rest = np.random.default_rng(0), np.repeat(driving[:1], 3000, axis=0)
+    A = np.concatenate([rest if of_rest is None else perturb(rest, of_rest, generator), driving])
+    B = perturb(inverse(simulation.Y["sensor0"]) @ A @ simulation.X["target0"], NOISE, generator)
+    problem = rw.Problem()
+    problem.add("target0", "sensor0", A, B, NOISE.sigma_m, NOISE.kappa)
+    return problem
+
+
 @pytest.mark.parametrize(
     "how", [dict(batch=100), dict(keep_measurements=False)], ids=["in batches, kept", "at once, not kept"]
 )
@@ -336,26 +348,13 @@ def test_a_world_far_away_changes_nothing(mode: str, distance: str, side: str, h
 @pytest.mark.parametrize("distance", FAR)
 def test_a_log_that_begins_at_rest_far_away(distance: str, side: str, how: dict[str, Any]) -> None:
     """Many measurements near one pose say little of where to centre; the others do."""
-    simulation = general(1, 1, seed=2, number_of_measurements=60)
-    driving = simulation.problem.measurements("target0", "sensor0").A
-    generator = np.random.default_rng(0)
-    A = np.concatenate([perturb(np.repeat(driving[:1], 3000, axis=0), Noise(1e-4, 1e7), generator), driving])
-    B = perturb(inverse(simulation.Y["sensor0"]) @ A @ simulation.X["target0"], NOISE, generator)
-    problem = rw.Problem()
-    problem.add("target0", "sensor0", A, B, NOISE.sigma_m, NOISE.kappa)
-    assert_as_if_near(problem, distance, side, how)
+    assert_as_if_near(driving_after_rest(Noise(1e-4, 1e7)), distance, side, how)
 
 
 @pytest.mark.parametrize("side", ["sensor carrier", "target carrier"])
 def test_a_log_that_begins_with_one_pose_repeated(side: str) -> None:
     """As an arm at rest gives it; centred by looking at the whole batch, for nothing is kept to begin anew."""
-    simulation = general(1, 1, seed=2, number_of_measurements=60)
-    driving = simulation.problem.measurements("target0", "sensor0").A
-    A = np.concatenate([np.repeat(driving[:1], 3000, axis=0), driving])
-    B = perturb(inverse(simulation.Y["sensor0"]) @ A @ simulation.X["target0"], NOISE, 0)
-    problem = rw.Problem()
-    problem.add("target0", "sensor0", A, B, NOISE.sigma_m, NOISE.kappa)
-    assert_as_if_near(problem, "1,000 km", side, dict(keep_measurements=False))
+    assert_as_if_near(driving_after_rest(None), "1,000 km", side, dict(keep_measurements=False))
 
 
 @pytest.mark.parametrize("how", BATCHES)

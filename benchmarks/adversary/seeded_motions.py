@@ -10,6 +10,7 @@ from collections.abc import Callable
 from typing import TypeAlias
 
 import numpy as np
+from rwhec_factors.se3 import pose
 
 Long = np.longdouble
 Poses: TypeAlias = tuple[np.ndarray, np.ndarray]
@@ -157,6 +158,4 @@ MOTIONS: dict[str, Callable[[np.random.Generator, int], Poses]] = {
 def doubles(poses: Poses) -> np.ndarray:
     """Matrices (n, 4, 4) of doubles: each entry is the nearest one."""
     R, t = poses
-    result = np.zeros((len(R), 4, 4))
-    result[:, :3, :3], result[:, :3, 3], result[:, 3, 3] = R, t, 1.0
-    return result
+    return pose(R, t)

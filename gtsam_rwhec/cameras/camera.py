@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -89,6 +90,12 @@ class Camera:
         kind = camera.model if camera.model == "equidistant" or len(coefficients) else "pinhole"
         count = next(count for count in COEFFICIENTS[kind] if count >= len(coefficients))
         return replace(camera, model=kind, D=np.pad(coefficients, (0, count - len(coefficients))))
+
+    @property
+    def numbers(self) -> dict[str, Any]:
+        """Its size, model, K and D, as files have them and `of` takes them."""
+        named = {"width": self.width, "height": self.height, "model": self.model}
+        return {**named, "K": self.K.tolist(), "D": self.D.tolist()}
 
     def _fault(self) -> str:
         """Why no supported camera has these intrinsics, with D without trailing zeros; empty if a camera can."""

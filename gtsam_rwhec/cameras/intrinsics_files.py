@@ -359,20 +359,11 @@ def is_colmap(text: str) -> bool:
 
 
 def read_colmap_cameras(path: str | Path) -> dict[str, Camera]:
-    """Read COLMAP's ``cameras.txt``; the principal point is moved by half a pixel, from COLMAP's corner to the middle.
+    """Read COLMAP's ``cameras.txt``, by its camera ids: ``1``, ``2`` and so on.
 
-    Returns
-    -------
-    dict of str to Camera
-        By COLMAP's camera ids: ``1``, ``2`` and so on.
-
-    Raises
-    ------
-    FileFormatError
-        The file cannot be read, has no cameras, or a line is no camera of a model that is supported. The message has
-        the line, and the models.
-    CameraError
-        No camera has these intrinsics.
+    The principal point is moved by half a pixel, from COLMAP's corner to the middle. Raises `FileFormatError` if the
+    file cannot be read, has no cameras, or a line is no camera of a supported model (the message has the line and the
+    models); `CameraError` if no camera has these intrinsics.
     """
     cameras: dict[str, Camera] = {}
     for number, line in enumerate(read_text(path).splitlines(), start=1):

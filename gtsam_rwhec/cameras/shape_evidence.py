@@ -88,14 +88,8 @@ def evidence_of_shape(
 ) -> ShapeEvidence | None:
     """Return the hypothesis that fits the views best; None if none of them can be tested.
 
-    Parameters
-    ----------
-    corners : (n, 3) array
-        The board's corners as stated, metres.
-    hypotheses : mapping to (n, 3, q) arrays
-        By how much each corner moves for each of the q numbers of a hypothesis.
-    views : sequence of BoardView
-        Only views of different poses count.
+    ``corners`` (n, 3) are the board's as stated, metres; ``hypotheses`` (n, 3, q) say by how much each corner moves for
+    each of the q numbers of a hypothesis. Only views of different poses count.
     """
     views = [views[i] for i in different([view.T for view in views])]
     if len(views) < LEAST_VIEWS:

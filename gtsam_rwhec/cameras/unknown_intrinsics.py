@@ -47,16 +47,8 @@ def fitted_to_planes(
 ) -> PlanesFitted | None:
     """Fit a pinhole with distortion to views of planes; None where OpenCV finds no fit.
 
-    Parameters
-    ----------
-    corners_m : sequence of (n_i, 3) arrays
-        With z = 0, metres.
-    corners_px : sequence of (n_i, 2) arrays
-    size : (int, int)
-        Width and height of the images, pixels.
-    distortion : "none", "radial" or "all"
-    K : (3, 3) array, optional
-        The start; by default the homographies give one.
+    ``corners_m`` (n_i, 3) have z = 0, metres; ``size`` is width and height of the images, pixels. ``K`` (3, 3) is the
+    start; by default the homographies give one.
     """
     with extra_named():
         import cv2

@@ -32,8 +32,8 @@ from .sources import Source as Source
 
 # What it answers after each take: the calibration so far, the next pose, and whether it is enough.
 from .live_answer import Answer as Answer
-from .live_advice import Decision as Decision
-from .live_advice import Proposal as Proposal
+from .live_answer import Decision as Decision
+from .live_answer import Proposal as Proposal
 
 # Who shows it.
 from .live_server import PageServer as PageServer

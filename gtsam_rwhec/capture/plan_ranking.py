@@ -84,20 +84,11 @@ def ranked(
     certainty: Array | float = 1.0,
     first: int | None = None,
 ) -> Ranking:
-    """The best candidates first.
+    """The ``count`` best candidates, if there are as many, the best first.
 
-    Parameters
-    ----------
-    W : (N, r, d)
-        The rows of each candidate.
-    number_seen : (N,)
-        How many targets are seen at each.
-    count : int
-        So many are chosen, if there are as many.
-    certainty : (N,), optional
-        How probably it is seen: while frames are known roughly, a likely gain counts more than a large one.
-    first : int, optional
-        The candidate that comes first all the same.
+    ``W`` (N, r, d) has the rows of each candidate, ``number_seen`` (N,) how many targets are seen at each, and
+    ``certainty`` (N,) how probably: while frames are known roughly, a likely gain counts more than a large one.
+    ``first`` is the candidate that comes first all the same.
     """
     covariance = np.linalg.inv(cell.known + np.diag(cell.rough))
     open_ = np.ones(len(W), dtype=bool)

@@ -156,10 +156,7 @@ def _of_refined(
         if pair.sensor in kit.cameras and pair.target in kit.boards:
             size = np.ones(2)
             if by_corners is None and problem is not None and pair in problem.pairs:
-                usual = np.einsum("nii->ni", problem.measurements(*pair).covariance_of_B()).reshape(-1, 2, 3)
-                size = np.array([found.rotation_rad, found.translation_m]) / np.sqrt(
-                    np.median(usual.mean(axis=2), axis=0)
-                )
+                size = np.array([found.rotation_rad, found.translation_m]) / _usual_noise(problem, pair)
         noise[pair] = size
     of_target = refined.scale if isinstance(refined.scale, dict) else dict.fromkeys(refined.X, float(refined.scale))
     cell = Cell(
@@ -184,6 +181,12 @@ def _share(cell: Cell, problem: Problem) -> float:
     answer = cell.known[np.ix_(frames, frames)]
     values = np.linalg.eigvals(np.linalg.solve(alone[np.ix_(frames, frames)] + np.diag(cell.rough[frames]), answer))
     return float(min(1.0, np.exp(np.mean(np.log(np.maximum(values.real, 1e-12))))))
+
+
+def _usual_noise(problem: Problem, pair: Pair) -> Array:
+    """The standard deviations (2,) of a usual measurement, rad and m."""
+    variances = np.einsum("nii->ni", problem.measurements(*pair).covariance_of_B()).reshape(-1, 2, 3).mean(axis=2)
+    return np.asarray(np.sqrt(np.median(variances, axis=0)))
 
 
 def _poses(problem: Problem | None) -> Array:
@@ -248,8 +251,9 @@ def _of_problem(problem: Problem, kit: Kit, options: PlanOptions) -> Cell:
         problem = stated
     is_nominal = False
     if not X and kit.boards and sensors and sensors[0] in kit.cameras:
-        name, present = next(iter(kit.boards)), _present(options)
-        is_nominal = True
+        name, is_nominal = next(iter(kit.boards)), True
+        given = options.present
+        present = np.eye(4) if given is None else one_transform(given, "PlanOptions.present")
         X = {name: se3.inverse(present) @ Y[sensors[0]] @ in_front(kit.cameras[sensors[0]], kit.boards[name])}
     sizes = {name: 6 for name in (*X, *Y) if name not in problem.fixed}
     if problem.scale != "known":
@@ -267,9 +271,8 @@ def _of_problem(problem: Problem, kit: Kit, options: PlanOptions) -> Cell:
             rough[at] = 1.0
     noise = {}
     for pair in seen:
-        usual = np.einsum("nii->ni", problem.measurements(*pair).covariance_of_B()).reshape(-1, 2, 3).mean(axis=2)
         has_corners = pair.sensor in kit.cameras and pair.target in kit.boards
-        noise[pair] = np.ones(2) if has_corners else np.sqrt(np.median(usual, axis=0))
+        noise[pair] = np.ones(2) if has_corners else _usual_noise(problem, pair)
     cell = Cell(
         X, Y, scale, kit, slots, dimension, noise, kit.carrier_noise, known, rough,
         np.zeros((dimension, dimension)), np.inf, _poses(problem), _views(problem, kit), is_rough=False,
@@ -295,7 +298,3 @@ def _excess(cell: Cell, problem: Problem) -> float:
             total += float(np.einsum("ni,nij,nj->", residual, np.linalg.inv(noise), residual))
             spare += residual.size
     return max(1.0, total / float(chdtri(spare, CHANCE))) if spare > 0 else 1.0
-
-
-def _present(options: PlanOptions) -> Array:
-    return np.eye(4) if options.present is None else one_transform(options.present, "PlanOptions.present")

@@ -112,6 +112,15 @@ class Source(ABC):
         """Whether the rig file needs a topic."""
         return topic in self._wanted or (self.rig.carriers.poses.topic is None and is_of_transforms(topic, schema))
 
+    def messages_of(self, file: McapFile, block: Block, of: str) -> Iterator[Message]:
+        """The messages of a file's block by log time; a damaged block counts as a part ``of`` its kind of file."""
+        try:
+            yield from messages_of_block(file, block)
+        except BudgetError:
+            raise
+        except LogError as error:
+            self.say(f"damaged parts of the {of}", str(error))
+
     def say(self, what: str, first: str) -> None:
         """Count what could not be used."""
         self.troubles.setdefault(what, Trouble(what, first)).count += 1
@@ -184,16 +193,11 @@ class ReplayedLog(Source):
                 file.spending.begin_pass()
             begun_s, first_ns = time.monotonic(), min((block.start_ns for _, block in blocks), default=0)
             for file, block in blocks:
-                try:
-                    for message in messages_of_block(file, block):
-                        due_s = begun_s + 1e-9 * (message.received_ns - first_ns) / self.speed
-                        await asyncio.sleep(max(0.0, due_s - time.monotonic()))
-                        if self.wants(message.channel.topic, message.schema.name if message.schema else ""):
-                            yield message
-                except BudgetError:
-                    raise
-                except LogError as error:
-                    self.say("damaged parts of the log", str(error))
+                for message in self.messages_of(file, block, "log"):
+                    due_s = begun_s + 1e-9 * (message.received_ns - first_ns) / self.speed
+                    await asyncio.sleep(max(0.0, due_s - time.monotonic()))
+                    if self.wants(message.channel.topic, message.schema.name if message.schema else ""):
+                        yield message
         self.state = "the log is at its end"
 
 
@@ -215,16 +219,11 @@ class FollowedFile(Source):
             while not file.is_ended:
                 self.state = "following the file"
                 for block in file.new_blocks():
-                    try:
-                        for message in messages_of_block(file, block):
-                            schema = message.schema.name if message.schema else ""
-                            self.topics[message.channel.topic] = schema
-                            if self.wants(message.channel.topic, schema):
-                                yield message
-                    except BudgetError:
-                        raise
-                    except LogError as error:
-                        self.say("damaged parts of the file", str(error))
+                    for message in self.messages_of(file, block, "file"):
+                        schema = message.schema.name if message.schema else ""
+                        self.topics[message.channel.topic] = schema
+                        if self.wants(message.channel.topic, schema):
+                            yield message
                     await asyncio.sleep(0)
                 await asyncio.sleep(POLL_S)
             self.state = "the recorder has closed the file"

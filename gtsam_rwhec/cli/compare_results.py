@@ -59,6 +59,7 @@ def diff(
 ) -> ExitStatus:
     """What moved from an old calibration to a new one, and whether by more than chance; exit status 1 if so."""
     check_output(output, *(file for each in (old, new) for file in read_of(each)))
+    checksums = old_checksums(old)
     found = rw.results.difference(
         rw.results.read_calibration(old),
         rw.results.read_calibration(new),
@@ -66,19 +67,13 @@ def diff(
         frames=frame or (),
         clocks_may_change=clocks_may_change,
         same_arm=not other_arm,
-        same_measurements=have_same_inputs(old, new),
+        same_measurements=bool(checksums) and checksums == old_checksums(new),
     )
     rw.report.print_difference(found)
     write_page_to(found, output, (old, new))
     if found.test is None and not found.is_same:
         return ExitStatus.BAD_INPUT
     return ExitStatus.CHANGED if found.has_changed else ExitStatus.DONE
-
-
-def have_same_inputs(old: Path, new: Path) -> bool:
-    """Whether the evidence beside two results names input files with the same checksums."""
-    first, second = map(old_checksums, (old, new))
-    return bool(first) and first == second
 
 
 def old_checksums(result: Path) -> set[str]:

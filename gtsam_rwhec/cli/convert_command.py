@@ -60,23 +60,17 @@ def convert(
             refuse(context, NOT_WITH_A_RIG)
             described = rw.rig.read_rig(rig)
             if rw.runs.is_file_of_samples(source, described):
-                reading = rw.runs.write_samples_log(source, described, output)
-                say(
-                    f"{reading}.\nWritten to {shown_path(output)}.\n"
-                    f"Next: gtsam-rwhec calibrate {shown_path(output)} --rig {shown_path(rig)} -o out"
-                )
-                return ExitStatus.DONE
-            if not rw.runs.is_folder_of_images(source, described):
+                said = f"{rw.runs.write_samples_log(source, described, output)}.\nWritten to {shown_path(output)}."
+            elif rw.runs.is_folder_of_images(source, described):
+                images, number = rw.runs.write_folder_log(source, described, output, progress=stage)
+                what = "images" if any(sensor.images is not None for sensor in described.sensors.values()) else "clouds"
+                said = f"Written to {shown_path(output)}: {images} {what} and {number} poses."
+            else:
                 raise LogError(
                     f"{source}: --rig is for a folder of images with poses beside them, and a rig file with "
                     "carriers.poses: {frames: [parent, child]}. Leave --rig out for a bag"
                 )
-            images, number = rw.runs.write_folder_log(source, described, output, progress=stage)
-            what = "images" if any(sensor.images is not None for sensor in described.sensors.values()) else "clouds"
-            say(
-                f"Written to {shown_path(output)}: {images} {what} and {number} poses.\n"
-                f"Next: gtsam-rwhec calibrate {shown_path(output)} --rig {shown_path(rig)} -o out"
-            )
+            say(f"{said}\nNext: gtsam-rwhec calibrate {shown_path(output)} --rig {shown_path(rig)} -o out")
             return ExitStatus.DONE
         if poses is not None:
             images, number = rw.logs.write_image_folder(

@@ -85,9 +85,7 @@ def plan(
     names = (file.carriers.sensors, file.carriers.targets) if file is not None else ("sensorcarrier", "targetcarrier")
     sensors_move = file is None or file.carriers.poses.parent_and_child[1] == names[0]
     fixed, moving = names[::-1] if sensors_move else names
-    now = None
-    if present is not None:
-        now = rw.capture.stated_pose(present, "--present", is_inverse=sensors_move)
+    now = None if present is None else rw.capture.stated_pose(present, "--present", is_inverse=sensors_move)
     arm = None
     if urdf is not None:
         arm = rw.capture.Arm.read(

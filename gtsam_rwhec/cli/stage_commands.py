@@ -138,18 +138,12 @@ def export(
     anyway: AnywayOption = False,
 ) -> ExitStatus:
     """Last stage: write a launch file, tf, URDF, cameras (Kalibr, ROS, OpenCV, COLMAP) from a solved log."""
-    if rw.odometry.is_of_odometries(None, solved):
-        with StageDisplay() as stage:
-            for path in rw.odometry.export_odometries(solved, output, anyway=anyway, progress=stage):
-                say(shown_path(path))
-        return _said(rw.odometry.read_odometries(solved), anyway=anyway)
+    is_of_odometries = rw.odometry.is_of_odometries(None, solved)
+    write = rw.odometry.export_odometries if is_of_odometries else rw.runs.export_solved
     with StageDisplay() as stage:
-        for path in rw.runs.export_solved(solved, output, anyway=anyway, progress=stage):
+        for path in write(solved, output, anyway=anyway, progress=stage):
             say(shown_path(path))
-    return _said(rw.runs.read_solved(solved), anyway=anyway)
-
-
-def _said(found: rw.runs.Solved | rw.odometry.OdometrySolved, *, anyway: bool) -> ExitStatus:
+    found = rw.odometry.read_odometries(solved) if is_of_odometries else rw.runs.read_solved(solved)
     if found.judgement.verdict is not rw.Verdict.USE:
         say(str(found.judgement), to_errors=True)
     for message in exported(found, anyway=anyway):

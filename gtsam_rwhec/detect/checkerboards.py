@@ -157,12 +157,8 @@ def fitted_corners(gray: Gray, on_image: Callable[[Array], Array], rows: int, co
     The model's light changes linearly, separately for paper and ink. Pixels that do not fit, as at a shadow's edge,
     weigh little; a corner where many do not fit is not sharp.
 
-    Parameters
-    ----------
-    gray : (height, width) uint8
-    on_image : callable
-        Takes places (..., 2) on the board, in squares to the right and down from the first corner, to pixels (..., 2)
-        that are right to one or two pixels.
+    ``on_image`` takes places (..., 2) on the board, in squares to the right and down from the first corner, to pixels
+    (..., 2) that are right to one or two pixels.
     """
     first = np.stack(np.meshgrid(np.arange(columns), np.arange(rows)), axis=-1).reshape(-1, 2).astype(float)
     at, sigma = first, None

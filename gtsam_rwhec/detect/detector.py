@@ -259,7 +259,7 @@ class Detector:
     def _detection(self, sighting: Sighting, poses: PlanePoses, k: int) -> Detection:
         """The detection of a sighting, whose pose is number k of `poses`."""
         T, rms = poses.T[k], poses.reprojection_px[k]
-        side = _shortest_side(sighting.target, sighting.corners_px)
+        side = shortest_side_px(sighting.target, sighting.corners_px)
         rejection = sighting.rejection or self._rejection(sighting, side, T[0], float(rms[0]))
         if rejection and not self.camera.has_ray(sighting.corners_px).all():  # which explains all other reasons
             rejection = Rejection.NO_RAY
@@ -308,7 +308,8 @@ def _kind(target: Target) -> _Kind:
     return target.family, 2 if isinstance(target, AprilGrid) else 1
 
 
-def _shortest_side(target: Target, corners: Array) -> float:
+def shortest_side_px(target: Target, corners_px: Array) -> float:
+    """The shortest side of a tag, or of the box that holds a board's seen corners (n, 2), pixels."""
     if isinstance(target, Tag):
-        return float(np.linalg.norm(np.roll(corners, -1, axis=0) - corners, axis=1).min())
-    return float(np.ptp(corners, axis=0).min()) if len(corners) else 0.0
+        return float(np.linalg.norm(np.roll(corners_px, -1, axis=0) - corners_px, axis=1).min())
+    return float(np.ptp(corners_px, axis=0).min()) if len(corners_px) else 0.0

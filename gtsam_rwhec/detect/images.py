@@ -196,10 +196,7 @@ _DEPTH = {"16uc1": "u2", "mono16": "u2", "32fc1": "f4"}
 def decode_depth(image: ImageRecord, size: Size) -> NDArray[Any]:
     """Pixels (height, width) of a depth image as they were recorded: 16 bits, or 32 of floating point.
 
-    Raises
-    ------
-    ImageError
-        As `decode_gray`; or the pixels are of 8 bits, or quantised, and so no depths.
+    Raises `ImageError` as `decode_gray`; or the pixels are of 8 bits, or quantised, and so no depths.
     """
     where = f"topic {image.topic}, image at {image.stamp_ns} ns"
     encoding = image.encoding.strip().lower()
@@ -238,10 +235,7 @@ def has_depths(image: ImageRecord, *, is_named: bool) -> bool:
 def decode_small(image: ImageRecord, width: int) -> Gray:
     """Pixels, 8 bits, of a small picture of so many columns; a JPEG is decoded at a part of its size, which is faster.
 
-    Raises
-    ------
-    ImageError
-        As `decode_gray`.
+    Raises `ImageError` as `decode_gray`.
     """
     where = f"topic {image.topic}, image at {image.stamp_ns} ns"
     size = stated_size(image.data) if image.is_compressed and image.data.startswith(JPEG) else None

@@ -10,7 +10,7 @@ import threading
 from collections import Counter, deque
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -137,7 +137,7 @@ def _finished(known: list[DetectedImage]) -> Future[list[DetectedImage]]:
     return future
 
 
-class _Processes:
+class _Processes(AbstractContextManager["_Processes"]):
     """Processes that start when they are first asked for, and are killed when the detection ends early."""
 
     def __init__(self, count: int) -> None:
@@ -156,9 +156,6 @@ class _Processes:
         assert self._pool is not None
         future: Future[list[DetectedImage]] = self._pool.submit(look, batch, make_detector)
         return future
-
-    def __enter__(self) -> _Processes:
-        return self
 
     def __exit__(self, kind: object, error: object, traceback: object) -> None:
         if self._pool is not None:

@@ -268,14 +268,8 @@ class DrawnErrors(NamedTuple):
 def draw_errors(gray: Gray, seen: Array, errors: Array) -> DrawnErrors:
     """Draw the part of an image with a target: circles where corners were seen, crosses where they are predicted.
 
-    Parameters
-    ----------
-    gray : (height, width) array
-    seen : (n, 2) array
-        Pixels.
-    errors : (n, 2) array
-        Seen minus predicted, pixels. A line goes from each circle towards its cross, magnified; the largest errors have
-        numbers, 1 for the largest.
+    ``errors`` (n, 2) are seen (n, 2) minus predicted, pixels. A line goes from each circle towards its cross,
+    magnified; the largest errors have numbers, 1 for the largest.
     """
     left, top, right, bottom = _window(gray, seen)
     scale = SIDE_PX / max(right - left, bottom - top)

@@ -32,10 +32,8 @@ _KINDS = (
 def opened(path: str | Path) -> BinaryIO:
     """A stream of an ordinary file, or of a descriptor of this process.
 
-    Raises
-    ------
-    FileFormatError
-        No file can have this name; there is no such file, it may not be read, or it is a folder, a pipe or a device.
+    Raises `FileFormatError` if no file can have this name, there is none, it may not be read, or it is a folder, a pipe
+    or a device.
     """
     try:
         # Without O_NONBLOCK, opening a pipe waits until somebody writes to it.
@@ -56,10 +54,7 @@ def opened(path: str | Path) -> BinaryIO:
 def read_whole(path: str | Path, most_bytes: int, expected: str) -> bytes:
     """The content of a file of at most `most_bytes`; `expected` says in words what should be in it.
 
-    Raises
-    ------
-    FileFormatError
-        As `opened`; or the file has more bytes, or reading it fails.
+    Raises `FileFormatError` as `opened`; or the file has more bytes, or reading it fails.
     """
     with opened(path) as stream:
         try:
@@ -115,12 +110,9 @@ def why_not_writable(path: str | Path) -> str:
 
 
 def appending_stream(path: str | Path) -> BinaryIO:
-    """A stream that appends to a file. The written data must themselves show whether they are complete.
+    """A stream that appends to a file; `OSError` if it cannot be written.
 
-    Raises
-    ------
-    OSError
-        When the file cannot be written.
+    The written data must themselves show whether they are complete.
     """
     return open(path, "ab")
 

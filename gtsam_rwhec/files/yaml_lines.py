@@ -82,13 +82,7 @@ def read_yaml(path: str | Path) -> YamlFile:
 
 
 def read_text(path: str | Path) -> str:
-    """The text of a small file.
-
-    Raises
-    ------
-    FileFormatError
-        When the file cannot be read, is larger than `MOST_BYTES` or is not UTF-8.
-    """
+    """The text of a small file; `FileFormatError` if it cannot be read, is larger than `MOST_BYTES` or is not UTF-8."""
     content = read_whole(path, MOST_BYTES, "YAML was")
     try:
         return content.decode("utf-8-sig")
@@ -251,10 +245,7 @@ _TAGS = (OPENCV_MATRIX, "tag:yaml.org,2002:opencv-nd-matrix")
 def parse_storage(text: str, where: str, most_values: int = MOST_VALUES) -> YamlFile:
     """Parse a file in YAML, JSON, or OpenCV's XML; OpenCV's matrices are mappings with rows, cols, dt and data.
 
-    Raises
-    ------
-    FileFormatError
-        As `parse_yaml`; or the XML is not OpenCV's. The message has the line.
+    Raises `FileFormatError` as `parse_yaml`; or the XML is not OpenCV's. The message has the line.
     """
     bare = text.lstrip()
     if bare.startswith("<"):

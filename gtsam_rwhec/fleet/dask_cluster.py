@@ -50,13 +50,8 @@ _APPENDING = os.O_WRONLY | os.O_CREAT | os.O_APPEND
 class DaskCluster:
     """A scheduler and workers, each in its own process. They write to a log file, which error messages quote.
 
-    A worker that takes more than `memory_bytes` is stopped and restarted. A task whose worker died
-    `allowed_failures` times is tried once more.
-
-    Raises
-    ------
-    FleetError
-        The processes do not start; the message has the end of their output.
+    A worker that takes more than `memory_bytes` is stopped and restarted. A task whose worker died `allowed_failures`
+    times is tried once more. Raises `FleetError` if the processes do not start, with the end of their output.
     """
 
     def __init__(self, workers: int, memory_bytes: int, allowed_failures: int, dashboard: bool) -> None:

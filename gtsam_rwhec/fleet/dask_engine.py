@@ -14,7 +14,7 @@ import time
 import uuid
 from collections.abc import Iterable, Iterator
 from concurrent.futures import CancelledError
-from contextlib import suppress
+from contextlib import AbstractContextManager, suppress
 from importlib.util import find_spec
 from itertools import count, islice
 from typing import Any
@@ -48,7 +48,7 @@ def bytes_of(size: str) -> int:
     return int(float(found[1]) * (1024 if found[3] else 1000) ** " kmgt".index(found[2].lower() or " "))
 
 
-class DaskEngine:
+class DaskEngine(AbstractContextManager["DaskEngine"]):
     """Runs tasks on Dask's workers, which start with the first task. As a context manager it stops what it started.
 
     Parameters
@@ -170,9 +170,6 @@ class DaskEngine:
         _CLIENT_LOG.setLevel(self._level)
         if self.cluster is not None:
             self.cluster.close()
-
-    def __enter__(self) -> DaskEngine:
-        return self
 
     def __exit__(self, *raised: object) -> None:
         self.close()

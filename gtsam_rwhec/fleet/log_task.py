@@ -13,7 +13,7 @@ import numpy as np
 from gtsam_rwhec.calibration.verdict import Finding, Ground
 from gtsam_rwhec.errors import LogError, RigError, RwhecError, RwhecWarning, StoreInterruptedError
 from gtsam_rwhec.fleet.manifest import RigSource
-from gtsam_rwhec.fleet.partial_result import FORMAT_VERSION, LogFacts, PairMeasurements, PartialResult, camera_fields
+from gtsam_rwhec.fleet.partial_result import FORMAT_VERSION, LogFacts, PairMeasurements, PartialResult
 from gtsam_rwhec.fleet.stores import shown, stamp_of
 from gtsam_rwhec.fleet.tasks import Receipt, filed, key_of
 from gtsam_rwhec.fleet.topic_copy import local_copy_of_topics
@@ -57,12 +57,8 @@ class LogTask:
 def map_log(task: LogTask, output: str) -> Receipt:
     """Read a log, detect, clean, and write its measurements to the output (a folder or a URL).
 
-    Raises
-    ------
-    RwhecError
-        As ``detect_log`` and ``clean_log`` do; or the log changed while it was read.
-    OSError
-        The store broke off.
+    Raises `RwhecError` as ``detect_log`` and ``clean_log`` do, or if the log changed while it was read; `OSError` if
+    the store broke off.
     """
     return filed(output, task.key, task.file, lambda folder: _partial(task, folder).packed())
 
@@ -141,7 +137,7 @@ def _of_cleaned(task: LogTask, log: Log, rig: Rig) -> PartialResult:
         begin_ns=min(int(one.stamps_ns[0]) for one in kept.values()),
         end_ns=max(int(one.stamps_ns[-1]) for one in kept.values()),
         about=motion.about,
-        cameras={sensor: camera_fields(camera) for sensor, camera in metadata.cameras.items()},
+        cameras={sensor: camera.numbers for sensor, camera in metadata.cameras.items()},
         detection=metadata.detection.model_copy(update={"sources": (shown(task.url).rpartition("/")[2],)}),
         cleaning=metadata.cleaning,
         poses=poses_used(pairs.values()),

@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, ValidationError
+from rwhec_factors.se3 import pose
 
 from gtsam_rwhec.calibration.verdict import Finding, Ground
 from gtsam_rwhec.cameras.camera import Camera
@@ -57,14 +58,6 @@ class LogFacts(BaseModel):
     def camera(self, sensor: str) -> Camera:
         """The intrinsics of a sensor."""
         return Camera.of(**self.cameras[sensor], where=f"{self.url}: {sensor}")
-
-
-def camera_fields(camera: Camera) -> dict[str, Any]:
-    """What `LogFacts.camera` reads."""
-    return {
-        "width": camera.width, "height": camera.height, "model": camera.model, "K": camera.K.tolist(),
-        "D": camera.D.tolist(),
-    }  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False)
@@ -146,9 +139,8 @@ def _pair(arrays: Mapping[str, np.ndarray], i: int) -> PairMeasurements:
 
 
 def _poses(rows: Array) -> Array:
-    T = np.tile(np.eye(4), (len(rows), 1, 1))
-    T[:, :3] = rows.reshape(-1, 3, 4)
-    return T
+    T = rows.reshape(-1, 3, 4)
+    return pose(T[..., :3], T[..., 3])
 
 
 def with_sensor_names(facts: LogFacts, names: Mapping[str, str]) -> LogFacts:
@@ -191,16 +183,10 @@ def with_sensor_names(facts: LogFacts, names: Mapping[str, str]) -> LogFacts:
 def history_of_logs(
     logs: Sequence[LogFacts], carriers: tuple[str, str], outliers: Mapping[Pair, tuple[int, int]]
 ) -> LogFields:
-    """The histories of all logs of a unit joined into one, in the form of a result file.
+    """The histories of all logs of a unit (one at least) joined into one, in the form of a result file.
 
-    Parameters
-    ----------
-    logs : sequence of LogFacts
-        At least one; with the sensors' names in the unit.
-    carriers : (str, str)
-        Of the sensors, and of the targets.
-    outliers : dict of Pair to (int, int)
-        For each pair in the answer: how many measurements are used, and how many there were.
+    The logs have the sensors' names in the unit; ``carriers`` are those of the sensors and of the targets. ``outliers``
+    has for each pair in the answer how many measurements are used, and how many there were.
     """
     detections, cleanings = [log.detection for log in logs], [log.cleaning for log in logs]
     offsets: dict[str, list[float]] = {}

@@ -56,14 +56,9 @@ def shown(url: str) -> str:
 
 
 def without_secrets(text: str, url: str = "") -> str:
-    """`text` with `HIDDEN` in place of secrets and of words that look like secrets.
+    """A library's message, or any `text` that may quote one, with `HIDDEN` in place of what is secret or looks so.
 
-    Parameters
-    ----------
-    text
-        A library's message, or any text that may quote it.
-    url
-        Its user, password and query are secret.
+    Of `url`, user, password and query are secret.
     """
     known = {*_of_url(url), *_of_environment()}
     forms = {form for one in known for form in (one, quote(one, safe=""), quote_plus(one), repr(one)[1:-1])}

@@ -61,14 +61,8 @@ class Needed:
 def local_copy_of_topics(url: str, topics: Collection[str], folder: Path) -> Path:
     """A log on this machine's disk (the file itself or a copy) with all messages of some topics, and possibly others.
 
-    ``/tf`` or ``/tf_static`` stand for all topics of transforms. A copy is made in `folder`.
-
-    Raises
-    ------
-    StoreError, StoreInterruptedError
-        The store refuses or breaks off.
-    LogError
-        The copy cannot be written.
+    ``/tf`` or ``/tf_static`` stand for all topics of transforms. A copy is made in `folder`. Raises `StoreError` if the
+    store refuses, `StoreInterruptedError` if it breaks off, `LogError` if the copy cannot be written.
     """
     path = local_path(url)
     size = size_of(url)

@@ -63,14 +63,9 @@ def sensor_name(robot: str, sensor: str) -> str:
 
 
 def unit_problem(logs: Sequence[UnitLog], rigs: Mapping[str, Rig], *, at_site: bool) -> UnitProblem:
-    """The problem of a unit, from its logs in order of time.
+    """The problem of a unit, from its logs in order of time; `RigError` if they contradict each other.
 
     At a site several robots are solved together, each with carriers of its own: their clocks are not estimated.
-
-    Raises
-    ------
-    RigError
-        The logs contradict each other.
     """
     rig = next(iter(rigs.values()))
     noise_is = check_logs(logs, rig)
@@ -182,11 +177,8 @@ def _noise_of(log: PartialResult, rig: Rig) -> str:
 def check_rigs(rigs: Mapping[str, Sequence[tuple[str, Rig]]]) -> None:
     """Refuse rig files (by robot, each with its URL) that contradict each other.
 
-    Raises
-    ------
-    RigError
-        Two rig files differ in the type or size of a target, the intrinsics of a robot's sensor, the carriers' frames,
-        or the treatment of sizes and noise. The message names all differences.
+    A `RigError` names all differences in the type or size of a target, the intrinsics of a robot's sensor, the
+    carriers' frames, or the treatment of sizes and noise.
     """
     found: list[str] = []
     everyone = [(robot, url, rig) for robot, several in rigs.items() for url, rig in several]

@@ -96,12 +96,7 @@ def result_file(unit: str) -> str:
 def solve_unit(task: UnitTask, output: str) -> Receipt:
     """Solve a unit from the partial results of its logs; write its result files.
 
-    Raises
-    ------
-    RigError
-        Rig files or logs contradict each other.
-    RwhecError
-        As ``calibrate`` does.
+    Raises `RigError` if rig files or logs contradict each other, `RwhecError` as ``calibrate`` does.
     """
 
     def content(folder: Path) -> bytes:

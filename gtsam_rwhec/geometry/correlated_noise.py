@@ -67,12 +67,8 @@ class CorrelatedNoise:
 def likeliest(seconds: Array, residuals: Array, track: np.ndarray) -> tuple[CorrelatedNoise, float]:
     """The noise that makes residuals likeliest, and -2 log of this likelihood, up to a constant.
 
-    White noise is the answer unless another one is clearly likelier.
-
-    Parameters
-    ----------
-    seconds, residuals, track : (n,), (n, m) and (n,) arrays
-        As in ``CorrelatedNoise.weighted``. All columns have one variance; tracks are independent.
+    White noise is the answer unless another one is clearly likelier. ``seconds`` (n,), ``residuals`` (n, m) and
+    ``track`` (n,) are as in ``CorrelatedNoise.weighted``: all columns have one variance, and tracks are independent.
     """
     square = float((residuals**2).sum())
     best, lowest = CorrelatedNoise.white(), residuals.size * np.log(square + 1e-300) - CLEARLY_LIKELIER

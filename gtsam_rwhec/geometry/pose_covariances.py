@@ -65,10 +65,7 @@ def right_of_ros(T_a_b: gtsam.Pose3, covariance: ArrayLike) -> Array:
 def error_of(estimate: gtsam.Pose3, T_a_b: PoseLike) -> Array:
     """The error xi (6,) that an estimate's covariance describes: T_a_b = estimate Expmap(xi).
 
-    Raises
-    ------
-    PoseError
-        When T_a_b is not a valid pose.
+    Raises `PoseError` if T_a_b is not a valid pose.
     """
     truth = gtsam.Pose3(one_transform(T_a_b, "the pose to compare with"))
     return gtsam.Pose3.Logmap(estimate.inverse().compose(truth))

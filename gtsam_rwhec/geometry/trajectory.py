@@ -139,7 +139,6 @@ class SmoothPath:
     velocity_variance: Array  #: (K, 6): of c_1, from the poses' scatter
     scatter: Array  #: (6,): variance of a logged pose about the path, rad^2 and m^2
     degrees_of_freedom: float  #: of the scatter
-    half_window_s: float
 
     @staticmethod
     def of(path: Trajectory, longest_s: float = LONGEST_S) -> SmoothPath:
@@ -206,7 +205,7 @@ def _cubics_at_knots(path: Trajectory, half_s: float, most_knots: int | None = N
     free = max(fit.degrees_of_freedom, 1.0)
     scatter = fit.squares / free
     variance = fit.leverage[:, None] * scatter
-    return SmoothPath(stamps[at], path.T[at], fit.coefficients, variance, scatter, free, half_s)
+    return SmoothPath(stamps[at], path.T[at], fit.coefficients, variance, scatter, free)
 
 
 @dataclass(frozen=True)

@@ -255,12 +255,8 @@ TABLES = (".csv", ".txt", ".tum", ".dat", ".tsv", ".asc")
 def read_poses(path: str | Path, stated: PoseStatement | None = None) -> NamedPoses:
     """Read the poses of a file, or of a folder with one pose a file, whose names poses without a name then have.
 
-    `stated` is what the files do not say.
-
-    Raises
-    ------
-    LogError
-        There are no poses, or one cannot be read; the message has the file and the line.
+    `stated` is what the files do not say. Raises `LogError` if there are no poses, or one cannot be read, with the file
+    and the line.
     """
     path, stated = checked_path(path), stated or PoseStatement()
     if not path.is_dir():

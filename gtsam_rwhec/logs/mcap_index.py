@@ -103,14 +103,8 @@ def read_index(read: Read, path: Path, size: int, spending: Spending, *, with_ch
     """The index of a file of `size` bytes; None if there is none, or if the file does not bear it out.
 
     Only the footer and the index are read. Which channels a chunk has is kept with `with_channels` alone: they may take
-    twelve times the bytes of the index.
-
-    Raises
-    ------
-    BudgetError
-        It lists bytes of the file more than once, or its chunks yield more than a file of this size may.
-    LogError, or one of `FAULTS`
-        It is damaged.
+    twelve times the bytes of the index. Raises `BudgetError` if it lists bytes of the file more than once, or its
+    chunks yield more than a file of this size may; `LogError`, or one of `FAULTS`, if it is damaged.
     """
     footer_at = size - len(MAGIC) - FOOTER.size
     if footer_at < len(MAGIC):

@@ -12,6 +12,7 @@ from __future__ import annotations
 import heapq
 import warnings
 from collections.abc import Iterable, Iterator, Sequence
+from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Literal
 
@@ -64,7 +65,7 @@ def open_log(path: str | Path | Iterable[str | Path]) -> Log:
     return Log(files)
 
 
-class Log:
+class Log(AbstractContextManager["Log"]):
     """One or more MCAP files that `open_log` reads as one log. It is a context manager, which closes the files."""
 
     def __init__(self, files: list[McapFile]) -> None:
@@ -75,9 +76,6 @@ class Log:
         self.losses = [loss for file in files for loss in file.losses]
         if self.losses:
             warnings.warn("; ".join(self.losses), LogWarning, stacklevel=3)
-
-    def __enter__(self) -> Log:
-        return self
 
     def __exit__(self, *raised: object) -> None:
         for file in self.files:

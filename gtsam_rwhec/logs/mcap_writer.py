@@ -15,7 +15,7 @@ import os
 import re
 import struct
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager
+from contextlib import AbstractContextManager, ExitStack, contextmanager
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Literal
@@ -75,7 +75,7 @@ POINT_CLOUD = "\n".join(
 ).encode()
 
 
-class LogWriter:
+class LogWriter(AbstractContextManager["LogWriter"]):
     """A context manager that writes one MCAP file. A file of this name is replaced when the block ends without an
     error.
 
@@ -91,9 +91,6 @@ class LogWriter:
             self._writer = McapWriter(on_error.enter_context(self._file), compression=CompressionType.ZSTD)
             self._writer.start(profile="", library="gtsam-rwhec")
             on_error.pop_all()  # __exit__ closes the file
-
-    def __enter__(self) -> LogWriter:
-        return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
@@ -174,9 +171,7 @@ class LogWriter:
         head = _padded(struct.pack("<iI", time["sec"], time["nsec"]) + _cdr_text(frame)) + struct.pack("<I", len(T))
         poses = [[*part["position"].values(), *part["orientation"].values()] for part in _poses(T)]
         data = b"\0\1\0\0" + head + bytes(-len(head) % 8) + np.array(poses, "<f8").tobytes()
-        channel = self._channel(topic, "cdr", self._schema("geometry_msgs/msg/PoseArray", "ros2msg", POSE_ARRAY), {})
-        with self._saying():
-            self._writer.add_message(channel, stamp_ns, data, stamp_ns)
+        self._add(topic, "cdr", ("geometry_msgs/msg/PoseArray", "ros2msg", POSE_ARRAY), stamp_ns, data)
 
     def point_cloud(self, cloud: CloudRecord) -> None:
         """Write a ``sensor_msgs/msg/PointCloud2`` as ROS 2 does: CDR, little endian. The points are in the frame."""
@@ -188,11 +183,8 @@ class LogWriter:
             head += struct.pack("<I", 1)
         is_big = any(kind.startswith(">") for _, _, kind in cloud.fields)
         head = _padded(head + bytes([is_big])) + struct.pack("<III", cloud.step, cloud.row_step, len(cloud.data))
-        schema = self._schema("sensor_msgs/msg/PointCloud2", "ros2msg", POINT_CLOUD)
         data = b"".join((b"\0\1\0\0", head, cloud.data, b"\0"))
-        with self._saying():
-            channel = self._channel(cloud.topic, "cdr", schema, {})
-            self._writer.add_message(channel, cloud.logged_ns, data, cloud.logged_ns)
+        self._add(cloud.topic, "cdr", ("sensor_msgs/msg/PointCloud2", "ros2msg", POINT_CLOUD), cloud.logged_ns, data)
 
     def pose(self, topic: str, stamp_ns: int, frame: str, T: Array) -> None:
         """Write a ``foxglove.PoseInFrame`` of one pose (4, 4)."""
@@ -286,7 +278,11 @@ class LogWriter:
             data = json.dumps(message, allow_nan=False).encode()
         except ValueError as error:
             raise LogError(f"topic {topic}: a {schema} with numbers that are not finite cannot be written") from error
-        channel = self._channel(topic, "json", self._schema(schema, "jsonschema", json_schema(schema)), {})
+        self._add(topic, "json", (schema, "jsonschema", json_schema(schema)), stamp_ns, data)
+
+    def _add(self, topic: str, encoding: str, schema: tuple[str, str, bytes], stamp_ns: int, data: bytes) -> None:
+        """Write the bytes of a message of a schema (name, encoding, content)."""
+        channel = self._channel(topic, encoding, self._schema(*schema), {})
         with self._saying():
             self._writer.add_message(channel, stamp_ns, data, stamp_ns)
 

@@ -77,11 +77,8 @@ class NamedPoses:
 def poses_of(rows: Sequence[PoseRow], stated: PoseStatement) -> NamedPoses:
     """The transforms of rows.
 
-    Raises
-    ------
-    LogError
-        A row is no pose, angles without a stated convention or unit, or positions that look like millimetres. The
-        message has the place, and what to write.
+    Raises `LogError` if a row is no pose, has angles without a stated convention or unit, or positions look like
+    millimetres. The message has the place, and what to write.
     """
     T = np.tile(np.eye(4), (len(rows), 1, 1))
     for kind, made in (
@@ -211,10 +208,7 @@ Line = tuple[int, list[str]]
 def read_pose_table(path: str, text: str, *, stated: PoseStatement) -> list[PoseRow]:
     """The poses of a text; `stated` says what lines without names of columns have.
 
-    Raises
-    ------
-    LogError
-        A line is no pose; the message has the line and what was expected.
+    Raises `LogError` if a line is no pose, with the line and what was expected.
     """
     header, lines = _lines(path, text)
     if not lines:

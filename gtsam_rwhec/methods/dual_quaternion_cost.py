@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
+from rwhec_factors.se3 import pose
 
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.geometry.quaternions import LEFT, RIGHT, of_rows, to_rotations
@@ -48,10 +49,7 @@ def to_transform(q: Array, q_dual: Array) -> Array:
     square = float(q @ q)
     if not 0.0 < square < np.inf:
         raise ValueError(f"q = {q} has no length; a rotation needs one")
-    T = np.eye(4)
-    T[:3, :3] = to_rotations(q)
-    T[:3, 3] = (2.0 / square) * (times_vectors(q).T @ q_dual)  # q' = V t / 2 and V'V = |q|^2
-    return T
+    return pose(to_rotations(q), (2.0 / square) * (times_vectors(q).T @ q_dual))  # q' = V t / 2 and V'V = |q|^2
 
 
 def times_vectors(q: Array) -> Array:

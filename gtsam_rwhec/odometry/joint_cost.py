@@ -43,20 +43,10 @@ class JointForm:
     scaled: np.ndarray  #: (s,): which of the K have an unknown scale (0 is the first after sensor 0)
 
     @cached_property
-    def _of_rotations(self) -> np.ndarray:
-        """Numbers of the rotations' entries and of the constant."""
-        numbers: np.ndarray = np.r_[np.arange(9 * self.sensors), len(self.Q) - 1]
-        return numbers
-
-    @cached_property
-    def _linear(self) -> np.ndarray:
-        """Numbers of translations and scales."""
-        return np.arange(9 * self.sensors, len(self.Q) - 1)
-
-    @cached_property
     def _eliminated(self) -> tuple[Array, Array]:
         """The best translations and scales as a matrix times [vec R, 1], and the reduced form."""
-        r, t = self._of_rotations, self._linear
+        rotations, last = 9 * self.sensors, len(self.Q) - 1
+        r, t = np.r_[np.arange(rotations), last], np.arange(rotations, last)
         factor, _ = generalised_inverse_factor(self.Q[np.ix_(t, t)])
         rows = factor.T @ self.Q[np.ix_(t, r)]
         reduced = self.Q[np.ix_(r, r)] - rows.T @ rows
@@ -99,13 +89,8 @@ def joint_form(
 ) -> JointForm:
     """The form with the windows' rotations and translations fixed to those of ``state.motion``.
 
-    Parameters
-    ----------
-    variances : (m, 2) array
-        Variances of rotation (rad^2/s) and translation (m^2/s).
-    scaled : (m,) booleans
-    prior_rows : (q, d) array, optional
-        Whitened rows over y, from the user's prior knowledge.
+    ``variances`` (m, 2) are of rotation (rad^2/s) and translation (m^2/s), ``scaled`` (m,) booleans, and ``prior_rows``
+    (q, d) whitened rows over y, from the user's prior knowledge.
     """
     m, n = windows.used.shape
     K = m - 1

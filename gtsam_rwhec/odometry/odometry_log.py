@@ -40,7 +40,7 @@ from gtsam_rwhec.runs.cleaning_stage import cleaned
 from gtsam_rwhec.runs.detection_stage import detected
 from gtsam_rwhec.runs.measured_pairs import read_pairs, write_pairs
 from gtsam_rwhec.runs.odometry_cleaning import gates_of
-from gtsam_rwhec.runs.odometry_tracks import files_of, read_odometry, records_of_files
+from gtsam_rwhec.runs.odometry_motions import files_of, read_odometry, records_of_files
 from gtsam_rwhec.runs.output_folder import list_written, log_name, made_folder, made_output_folder, output_folder
 from gtsam_rwhec.runs.run_log import (
     CALIBRATION_LOG,

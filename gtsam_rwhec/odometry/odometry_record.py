@@ -14,7 +14,7 @@ from gtsam_rwhec.geometry.odometry_track import OdometryNoise
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.results.log_history import Removed
 from gtsam_rwhec.solver.certificate import Status
-from gtsam_rwhec.solver.free_directions import FreeDirection, FreeReason, Twist
+from gtsam_rwhec.solver.free_directions import AXIS_COSINE, FreeDirection, FreeReason, Twist
 
 #: The data contradict a given number that is more than this many standard deviations away: by chance one of 2,000.
 CONTRADICTED = 3.5
@@ -22,8 +22,6 @@ CONTRADICTED = 3.5
 NAMED = 4
 #: A sensor takes part in a free direction if it moves by more than this share of the largest shift or turn.
 TAKES_PART = 0.05
-#: A direction within 8 degrees of an axis of the reference is called by that axis.
-NEAR_AXIS = float(np.cos(np.radians(8.0)))
 #: What to do: if a direction is free, if a whole track is wrong, if a given number is contradicted.
 ADVICE = {
     Ground.NOT_UNIQUE: "state the missing heights in the rig file (given: {heights_m: {SENSOR: 0.5, ...}}, with that "
@@ -268,7 +266,7 @@ def _axis(v: Array) -> str:
     """``the z axis``, or a direction in numbers."""
     unit = v / np.linalg.norm(v)
     i = int(np.argmax(np.abs(unit)))
-    if abs(unit[i]) > NEAR_AXIS:
+    if abs(unit[i]) > AXIS_COSINE:
         return f"the {'xyz'[i]} axis"
     unit = unit * np.sign(unit[i])
     return f"({', '.join(f'{x:.2f}' for x in unit)})"

@@ -11,7 +11,7 @@ from collections import Counter
 from collections.abc import Mapping
 from importlib.metadata import version
 from pathlib import Path
-from typing import Annotated, Final, Literal
+from typing import Annotated, Any, Final, Literal
 
 import numpy as np
 from pydantic import Field, ValidationError
@@ -82,7 +82,7 @@ class FreeRecord(FileRecord):
 
     kind: str
     reason: str | None
-    frames: dict[str, tuple[float, ...]]
+    frames: Mapping[str, tuple[float, ...]]
     own_scales: dict[str, float]
     sentence: str
 
@@ -199,7 +199,7 @@ def result_of(
             FreeRecord(
                 kind=one.kind.value,
                 reason=one.reason.value,
-                frames=one.frames,  # type: ignore[arg-type]
+                frames=one.frames,
                 own_scales=one.own_scales,
                 sentence=str(one),
             )
@@ -222,7 +222,7 @@ def result_of(
             OtherRecord(
                 why=one.why,
                 cost_above=one.cost_above,
-                T_reference_sensor={name: _rows(T) for name, T in one.T_reference_sensor.items()},  # type: ignore[misc]
+                T_reference_sensor={name: _rows(T) for name, T in one.T_reference_sensor.items()},
             )
             for one in found.others
         ),
@@ -231,7 +231,7 @@ def result_of(
                 first=one.first,
                 second=one.second,
                 used=not one.why_not,
-                T_first_second=_rows(one.T_first_second),  # type: ignore[arg-type]
+                T_first_second=_rows(one.T_first_second),
                 information=_rows(one.information),
                 places=one.places,
                 map_s=2.0 * one.half_s,
@@ -298,9 +298,9 @@ def _sensor(found: OdometryCalibration, name: str, frames: Mapping[str, str]) ->
         child=frames.get(name, name),
         translation_m=tuple(T[:3, 3].tolist()),
         quaternion_wxyz=(q[3], q[0], q[1], q[2]),
-        T_parent_child=_rows(T),  # type: ignore[arg-type]
-        standard_deviations_deg=_finites(np.degrees(sigma[:3])),  # type: ignore[arg-type]
-        standard_deviations_mm=_finites(1e3 * sigma[3:]),  # type: ignore[arg-type]
+        T_parent_child=_rows(T),
+        standard_deviations_deg=_finites(np.degrees(sigma[:3])),
+        standard_deviations_mm=_finites(1e3 * sigma[3:]),
         covariance=tuple(map(_finites, covariance)),
         scale=found.scales.get(name),
         scale_sigma=scale_sigma,
@@ -325,9 +325,10 @@ def _track(found: OdometryCalibration, name: str) -> TrackRecord:
     )
 
 
-def _rows(T: Array) -> tuple[tuple[float, ...], ...]:
+def _rows(T: Array) -> Any:
+    """The rows as tuples, whose lengths the records check."""
     return tuple(tuple(row) for row in T.tolist())
 
 
-def _finites(numbers: Array) -> tuple[float | None, ...]:
+def _finites(numbers: Array) -> Any:
     return tuple(map(finite_or_none, numbers.tolist()))

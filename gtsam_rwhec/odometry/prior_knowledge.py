@@ -369,13 +369,9 @@ NEAR_RAD = np.radians(40.0)
 def up_direction(given: Given, windows: WindowMotions, variances: Array, reference: str) -> tuple[Array, float]:
     """The ground's normal (3,), pointing up, in the frame of sensor 0, and its standard deviation in rad.
 
-    Without a given ground it is the axis about which sensor 0 turned most. It is made to
-    point along +z, or, in an optical frame (z forward, y down), along -y.
-
-    Raises
-    ------
-    OptionError
-        Heights are given without the ground, and the turning axis is near neither z nor y.
+    Without a given ground it is the axis about which sensor 0 turned most. It is made to point along +z, or, in an
+    optical frame (z forward, y down), along -y. Raises `OptionError` if heights are given without the ground, and the
+    turning axis is near neither z nor y.
     """
     if given.ground is not None:
         return _unit(given.ground.normal), given.ground.sigma_rad

@@ -98,12 +98,8 @@ class TrajectoryErrors:
     ) -> TrajectoryErrors:
         """From residuals that have all of them.
 
-        Parameters
-        ----------
-        inverse : (p, p) array
-            Of the likelihood's second derivative by the unknowns, zero along what is free.
-        rest : (p,) array
-            The gradient of what is given beside the windows.
+        ``inverse`` (p, p) is of the likelihood's second derivative by the unknowns, zero along what is free; ``rest``
+        (p,) is the gradient of what is given beside the windows.
         """
         kinds, F = _columns(windows, layout, W)
         WF = [W[k] @ own for k, own in F.items()]

@@ -61,8 +61,7 @@ def points_as_given(
         spread: Array = _deviations(sigma, N, "sigma", where)[:, None, None] ** 2 * np.eye(3)
     else:
         spread = _checked_spread(covariances, N, where)
-    B, noise = np.tile(np.eye(4), (N, 1, 1)), np.zeros((N, 6, 6))
-    B[:, :3, 3] = p
+    B, noise = se3.pose(np.eye(3), p), np.zeros((N, 6, 6))
     noise[:, :3, :3] = MEANINGLESS_RAD**2 * np.eye(3)
     noise[:, 3:, 3:] = spread
     return GivenMeasurements(A, B, None, None, order, stamps_ns, noise, source, kind=Kind.POINT)
@@ -91,8 +90,7 @@ def planes_as_given(
             f"{where}: normal {bad[0]} has length {lengths[bad[0]]:.6g}; give unit vectors in the sensor's frame, all "
             "towards the same side of the plane"
         )
-    B, noise = np.tile(np.eye(4), (N, 1, 1)), np.zeros((N, 6, 6))
-    B[:, :3, :3], B[:, :3, 3] = frames_of(n / lengths[:, None]), p
+    B, noise = se3.pose(frames_of(n / lengths[:, None]), p), np.zeros((N, 6, 6))
     noise[:, 0, 0] = noise[:, 1, 1] = _deviations(normal_rad, N, "normal_rad", where) ** 2
     noise[:, 2, 2] = MEANINGLESS_RAD**2
     noise[:, 3, 3] = noise[:, 4, 4] = MEANINGLESS_M**2

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 
 from gtsam_rwhec.files.terminal_text import printable, rounded
@@ -63,7 +64,7 @@ def print_acceptance(found: Acceptance) -> None:
     cells = (f"{found.limit_mm:g}", f"{100.0 * found.level:g}", str(found.count), *map(rounded, numbers))
     print_blocks(console, [Paragraph(str(found), TONES[found.answer])])
     console.print()
-    if found.has_bounds:
+    if math.isfinite(found.upper_mm):
         print_blocks(console, [Table.of(TITLE, "sensor", HEADINGS, {found.sensor: cells}, LEGEND)])
     if found.remarks:
         print_heading(console, "Keep in mind")

@@ -22,7 +22,7 @@ from gtsam_rwhec.report.report_blocks import (
 )
 from gtsam_rwhec.report.shown_result import ShownResult
 from gtsam_rwhec.results.weak_poses import MORE, TURN_RAD, WEAK, WeakDirection
-from gtsam_rwhec.solver.free_directions import FreeReason, all_slide
+from gtsam_rwhec.solver.free_directions import AXIS_COSINE, FreeReason, all_slide
 
 #: A grid with more targets has a row for each target, and a column for each sensor.
 MOST_COLUMNS = 10
@@ -166,8 +166,6 @@ def _motions(shown: ShownResult) -> Iterator[Block]:
 
 
 NO_TURN = "No such turn would help clearly more than measuring on."
-#: A direction within 8 degrees of a coordinate axis is named after this axis.
-AXIS_COSINE = np.cos(np.radians(8.0))
 NOT_KNOWN = (
     "Not shown: the least known directions beside those that are free. They need evidence.json beside the result, and "
     "covariances that are finite for some frame."

@@ -125,16 +125,13 @@ def _drawn(
         figure = Figure(figsize=size_in, layout="constrained", dpi=72 if form == "svg" else FILE_DPI)
         stream = io.BytesIO()
         # figure.savefig goes over everything twice.
+        canvas: Any = FigureCanvasSVG(figure) if form == "svg" else FigureCanvasAgg(figure)
+        draw(figure)
+        bound_axes(figure)
         if form == "svg":
-            svg = FigureCanvasSVG(figure)
-            draw(figure)
-            bound_axes(figure)
-            svg.print_svg(stream, metadata={"Date": None, "Creator": None})  # type: ignore[no-untyped-call]
+            canvas.print_svg(stream, metadata={"Date": None, "Creator": None})
         else:
-            agg = FigureCanvasAgg(figure)
-            draw(figure)
-            bound_axes(figure)
-            agg.print_png(stream, metadata={"Software": None})  # type: ignore[no-untyped-call]
+            canvas.print_png(stream, metadata={"Software": None})
     return stream.getvalue()
 
 

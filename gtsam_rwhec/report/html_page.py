@@ -19,13 +19,7 @@ from gtsam_rwhec.report.report_blocks import Drawing, Link, Number, Page, Words,
 
 
 def write_page(page: Page, path: str | Path) -> None:
-    """Write a page.
-
-    Raises
-    ------
-    FileFormatError
-        The file cannot be written.
-    """
+    """Write a page; a `FileFormatError` says that the file cannot be written."""
     write_atomically(path, f"{page_html(page)}\n".encode("utf-8", "replace"))
 
 

@@ -53,10 +53,7 @@ def _copies(shown: ShownResult) -> Iterator[Block]:
 def frames_of_tree(tree: Mapping[str, Any]) -> RigFrames:
     """The frames of a result's JSON under the carriers' names that it has, with the verdict as a warning.
 
-    Raises
-    ------
-    FrameError
-        A name cannot be the name of a frame in other programs' files.
+    Raises `FrameError` if a name cannot be the name of a frame in other programs' files.
     """
     verdict = Verdict(tree["verdict"])
     warnings: tuple[str, ...] = () if verdict is Verdict.USE else (f"{verdict.words}: {tree['verdict_reason']}.",)

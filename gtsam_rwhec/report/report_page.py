@@ -106,10 +106,7 @@ def write_html(
 def write_figures(page: Page, folder: str | Path) -> list[Path]:
     """Write every chart of a page, and the still pictures of its scenes, as NAME.svg and NAME.png, black on white.
 
-    Raises
-    ------
-    FileFormatError
-        The folder cannot be made, or a file cannot be written.
+    Raises `FileFormatError` if the folder cannot be made, or a file cannot be written.
     """
     folder = Path(folder)
     try:

@@ -26,7 +26,7 @@ from gtsam_rwhec.report.figures import (
 )
 from gtsam_rwhec.report.report_blocks import Block, Chart, Folded, Paragraph, Section, Table, Words, significant, worded
 from gtsam_rwhec.report.shown_result import ShownResult
-from gtsam_rwhec.results.image_errors import SeenCamera
+from gtsam_rwhec.results.image_errors import CELLS, SeenCamera
 from gtsam_rwhec.results.residual_evidence import (
     BEYOND_3_BY_CHANCE,
     FEWEST,
@@ -258,8 +258,6 @@ SIGNS = ((LIGHT_BLUE, "o"), (VERMILLION, "^"), (GREEN, "s"), (ORANGE, "D"), (PUR
 MOST_BOXES = 14
 #: More signs than this become pixels.
 MANY = 600
-#: Arrows over the image: cells along its longer and its shorter side.
-CELLS = (8, 6)
 #: A cell with fewer corners has no arrow.
 FEWEST_CORNERS = 3
 #: The longest arrow, in cells.

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from enum import StrEnum
 from typing import Literal
@@ -159,8 +158,3 @@ class Acceptance:
             places = "; ".join(map(place_words, self.places_m))
             said += f" {'Points' if self.of == 'touches' else 'Boards'} near {places} tell most."
         return said
-
-    @property
-    def has_bounds(self) -> bool:
-        """Whether the error in the volume is bounded at all."""
-        return math.isfinite(self.upper_mm)

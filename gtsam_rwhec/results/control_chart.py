@@ -208,16 +208,8 @@ def checked_rate(nights: object) -> float:
 def limit_of(nights: int, frames: int, size: int, rate: float = RATE) -> float:
     """The limit of the statistic of a night.
 
-    Parameters
-    ----------
-    nights : int
-        In the chart, this one with them; at least 2.
-    frames : int
-        Frames that are tested alone.
-    size : int
-        Numbers of one frame, at most 6.
-    rate : float
-        False alarms a night.
+    The chart has so many ``nights``, this one with them, at least 2; so many ``frames`` are tested alone, of ``size``
+    numbers each, at most 6; ``rate`` is false alarms a night.
     """
     logs = _logs(frames, min(size, 6))
     kept, rates = _table()[0], sorted(logs)

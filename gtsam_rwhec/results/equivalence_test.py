@@ -113,11 +113,7 @@ class ErrorFit:
 def fit_error(touches: TouchRows, noise_m: tuple[float, float] | None = None) -> ErrorFit:
     """Estimate the error by least squares, and the touches' noise from the residuals unless it is stated.
 
-    Parameters
-    ----------
-    touches : TouchRows
-    noise_m : (across, along), optional
-        Standard deviation along each axis across the line of sight, and along it, metres.
+    ``noise_m`` is the standard deviation along each axis across the line of sight, and along it, metres.
     """
     rows, e, d = touches.rows, touches.errors_m, touches.sight
     n, _, m = rows.shape

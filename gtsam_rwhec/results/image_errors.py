@@ -12,7 +12,7 @@ from rwhec_factors import se3
 from gtsam_rwhec.cameras.camera import Camera
 from gtsam_rwhec.fitting.corner_residuals import shaped
 from gtsam_rwhec.fitting.refined import RefinedPoses
-from gtsam_rwhec.fitting.reprojection_record import SIZE, WARPS, Reprojection
+from gtsam_rwhec.fitting.reprojection_record import WARPS, BoardShape, Reprojection
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.results.file_record import Count, FileRecord, PositiveCount, Row
 
@@ -107,16 +107,17 @@ class CornerErrors(NamedTuple):
     counts: np.ndarray
 
 
+def warp_of(shape: BoardShape | None) -> Array:
+    """Heights (3,) of the edge over the middle along x, y and the diagonals, metres."""
+    found = {} if shape is None else dict(zip(shape.names, shape.values, strict=True))
+    return np.array([found.get(name, 0.0) for name in WARPS.values()])
+
+
 def board_of(refined: RefinedPoses, target: str, corners: Array) -> Array:
     """A target's corners (n, 3) with its estimated size and warp."""
     scale = refined.scale if isinstance(refined.scale, float) else refined.scale[target]
-    shape = np.array([1.0 / scale - 1.0, *[0.0] * len(WARPS)])
     found = None if refined.reprojection is None else refined.reprojection.boards.get(target)
-    if found is not None:
-        for name, value in zip(found.names, found.values, strict=True):
-            if name != SIZE and name in WARPS.values():
-                shape[1 + list(WARPS.values()).index(name)] = value
-    board = shaped(corners, shape)[0]
+    board = shaped(corners, np.r_[1.0 / scale - 1.0, warp_of(found)])[0]
     return board + np.array(found.corners_off_m) if found is not None and found.corners_off_m else board
 
 

@@ -203,10 +203,7 @@ def _of_class(base: Any, record: Any) -> Any:
 def checked_file(tree: dict[str, Any]) -> ResultFile:
     """Check the fields of a file and make records of them.
 
-    Raises
-    ------
-    ValueError
-        A field is missing, unknown or wrong, or two fields contradict one another; the message has the JSON path.
+    Raises `ValueError` if a field is missing, unknown or wrong, or two contradict one another, with the JSON path.
     """
     owner = "refined" if isinstance(tree.get("refined"), dict) else "certified"
     try:

@@ -84,13 +84,8 @@ def short_of_measurements(log: LogFields, poses: Mapping[str, int]) -> list[Find
     """What speaks against the sensors and targets of the rig file that have no answer, or rest on too few measurements.
 
     A sensor that was used at fewer than ``FEWEST_OF_A_FRAME`` poses has an answer that nothing can check. If a target
-    was seen at one or two, only its own pose is in doubt: the sensors' poses do not depend on it.
-
-    Parameters
-    ----------
-    log : LogFields
-    poses : mapping of sensor or target to int
-        At how many poses of the carriers the answer uses each; may lack those without any.
+    was seen at one or two, only its own pose is in doubt: the sensors' poses do not depend on it. ``poses`` has at how
+    many poses of the carriers the answer uses each, and may lack those without any.
     """
     sensors = log.detection.images
     targets = dict.fromkeys((*log.detection.unseen, *(track.target for track in log.detection.tracks)))

@@ -26,10 +26,11 @@ from gtsam_rwhec.cameras.targets import (
     square,
 )
 from gtsam_rwhec.files.optional_packages import extra_named
-from gtsam_rwhec.fitting.reprojection_record import WARPS, BoardShape
+from gtsam_rwhec.fitting.reprojection_record import BoardShape
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.problem.measurements import Pair
 from gtsam_rwhec.results.file_record import Count, FileRecord, Rows
+from gtsam_rwhec.results.image_errors import warp_of
 from gtsam_rwhec.results.linear_model import MeasuredRows
 
 #: The path is thinned to this many poses.
@@ -87,16 +88,8 @@ def scene_of(
 ) -> SceneEvidence | None:
     """What is needed to draw a rig; None where it has no poses, or nothing was measured.
 
-    Parameters
-    ----------
-    calibration : Calibration
-    rows : dict of Pair to MeasuredRows
-    carriers : (str or None, str or None)
-        Names of the carriers of the sensors and of the targets.
-    cameras : dict of str to Camera
-        Stated intrinsics; those that were estimated come first.
-    targets : dict of str to Target or (n, 3) array
-        As stated: what a target is, or its corners in metres.
+    ``carriers`` are the names of those of the sensors and of the targets. ``cameras`` are stated intrinsics; those that
+    were estimated come first. ``targets`` has as stated what a target is, or its corners (n, 3) in metres.
     """
     used = {
         pair: one
@@ -289,27 +282,17 @@ class DrawnBoard(FileRecord):
 def drawn_board(
     target: Target, scale: float = 1.0, shape: BoardShape | None = None, *, is_one_of_many: bool = False
 ) -> DrawnBoard:
-    """A target as it is drawn.
+    """A target as it is drawn; of one of many the modules of its tags are left out.
 
-    Parameters
-    ----------
-    target : Target
-        As the rig file states it.
-    scale : float
-        Its stated size over the true one.
-    shape : BoardShape, optional
-        Its warp, where it was estimated.
-    is_one_of_many : bool
-        The modules of its tags are left out.
+    ``scale`` is its stated size over the true one, ``shape`` its warp, where it was estimated.
     """
     has_modules = not is_one_of_many and len(target.ids) <= WITH_MODULES
     paper, dark = _parts(target, has_modules)
     if len(dark) > MOST_PARTS:
         dark = [dark[i] for i in np.linspace(0, len(dark) - 1, MOST_PARTS).round().astype(int).tolist()]
     reach = float(np.linalg.norm(target.corners(), axis=1).max())
-    warp = (
-        np.zeros(len(WARPS)) if isinstance(target, Bundle) else _warp(shape)
-    )  # a bundle's tags are in no common plane
+    # A bundle's tags are in no common plane.
+    warp = warp_of(None if isinstance(target, Bundle) else shape)
     bent = [_bent(polygon / scale, reach / scale, warp) for polygon in dark]
     if len(paper):
         low = min((float(polygon[:, 2].min()) for polygon in bent), default=0.0)
@@ -402,12 +385,6 @@ def _around(points: Array, share: float) -> Array:
 def _circle() -> Array:
     turn = np.linspace(0.0, 2.0 * np.pi, CIRCLE, endpoint=False)
     return np.stack([np.cos(turn), np.sin(turn), np.zeros(CIRCLE)], axis=1)
-
-
-def _warp(shape: BoardShape | None) -> Array:
-    """Heights (3,) of the edge over the middle along x, y and the diagonals, metres."""
-    found = {} if shape is None else dict(zip(shape.names, shape.values, strict=True))
-    return np.array([found.get(name, 0.0) for name in WARPS.values()])
 
 
 def _bent(points: Array, reach: float, warp: Array) -> Array:

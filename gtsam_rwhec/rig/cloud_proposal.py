@@ -100,10 +100,7 @@ class CloudProposal:
 def propose_cloud_rig(folder: Path, found: Sequence[CloudFolder], tell: Progress) -> CloudProposal:
     """A first rig file for folders of clouds with poses beside them; its notes say what was seen and chosen.
 
-    Raises
-    ------
-    RigError
-        No file of poses fits the clouds.
+    Raises `RigError` if no file of poses fits the clouds.
     """
     by_table = {clouds.path: list(_tables(folder, clouds)) for clouds in found}
     usable = [clouds for clouds in found if by_table[clouds.path] and is_text(clouds.path)]

@@ -102,11 +102,8 @@ def _of_clouds(log: Log, contents: LogContents) -> tuple[str, tuple[str, ...]] |
     topics = [topic for topic in topics if topic.count and is_text(topic.name) and not topic.unreadable]
     if not topics:
         return None
-    from gtsam_rwhec.rig.cloud_proposal import (
-        OBJECT,
-        ONE_SENSOR,
-        evidence_of_clouds,
-    )  # needs an extra that images do without
+    # It needs an extra that images do without.
+    from gtsam_rwhec.rig.cloud_proposal import OBJECT, ONE_SENSOR, evidence_of_clouds
 
     # a depth image's topic may show the same
     topic, *others = sorted(topics, key=lambda topic: not topic.has_clouds)

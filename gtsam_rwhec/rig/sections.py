@@ -12,6 +12,7 @@ from typing import Annotated, Any, Literal, TypeAlias
 
 import numpy as np
 from pydantic import BeforeValidator, model_validator
+from rwhec_factors.se3 import pose
 
 from gtsam_rwhec.cameras.camera import COEFFICIENTS, MODELS, Camera
 from gtsam_rwhec.cameras.unknown_intrinsics import Lens
@@ -45,18 +46,14 @@ def link_of_optical(numbers: Sequence[float] | None = None) -> Array:
 
     Raises `ValueError` if the quaternion is not of length 1.
     """
-    T = np.eye(4)
     if numbers is None:
-        T[:3, :3] = R_LINK_OPTICAL
-        return T
+        return pose(R_LINK_OPTICAL, np.zeros(3))
     given = np.asarray(numbers, dtype=float)
     length = float(np.linalg.norm(given[3:]))
     if abs(length - 1.0) > UNIT_LENGTH:
         words = f"the quaternion {given[3:].tolist()} has the length {length:.4g}"
         raise ValueError(f"{words}; give [x, y, z, qx, qy, qz, qw], metres and a unit quaternion")
-    T[:3, :3] = to_rotations(given[None, 3:] / length)[0]
-    T[:3, 3] = given[:3]
-    return T
+    return pose(to_rotations(given[3:] / length), given[:3])
 
 
 #: The word for intrinsics that nobody states; a file of this name is {file: estimate}.

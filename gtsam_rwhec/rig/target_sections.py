@@ -38,7 +38,7 @@ class _TargetSection(Section):
 
     def target(self, name: str) -> Target:
         """The target with this name."""
-        given = self.model_dump(exclude={"type", self.counted})
+        given = self.model_dump(exclude={"type", self.counted}, exclude_none=True)
         if self.counted:
             given["columns"], given["rows"] = getattr(self, self.counted)
         return self.made(name=name, **given)
@@ -94,12 +94,6 @@ class TagGridTarget(_TargetSection):
     ids: Annotated[tuple[int, ...], Field(max_length=10_000)] | None = optional(
         "of all tags, left to right, from the top, in place of first_id", [7, 3, 9, 4]
     )
-
-    def target(self, name: str) -> Target:
-        """The target with this name."""
-        columns, rows = self.tags
-        sizes = {"tag_m": self.tag_m, "gap_m": self.gap_m}
-        return TagGrid(name, self.family, columns, rows, **sizes, first_id=self.first_id, ids=self.ids or ())
 
 
 class BundleTagPlace(Section):

@@ -29,7 +29,7 @@ from .recorded_logs import samples_problem as samples_problem
 from .recorded_logs import write_samples_log as write_samples_log
 
 # Sensors that know only their own motion.
-from .odometry_tracks import read_odometry as read_odometry
+from .odometry_motions import read_odometry as read_odometry
 
 # What comes out, and what a log that a stage wrote holds.
 from .output_folder import earlier_run as earlier_run
@@ -42,7 +42,7 @@ from .run_log import read_cameras as read_cameras
 from .run_log import read_metadata as read_metadata
 from .measured_pairs import MeasuredPairs as MeasuredPairs
 from .measured_pairs import read_pairs as read_pairs
-from .solved_log import read_solved as read_solved
+from .whole_runs import read_solved as read_solved
 from .solving_stage import Calibrated as Calibrated
 from .solving_stage import Solved as Solved
 from .solving_stage import solve_log as solve_log

@@ -23,8 +23,7 @@ from gtsam_rwhec.runs.changed_rig import rig_for_cleaning
 from gtsam_rwhec.runs.clocks_by_turning import offset_of_either_direction
 from gtsam_rwhec.runs.measured_pairs import MeasuredPairs, detected_pairs, pair_records
 from gtsam_rwhec.runs.odometry_cleaning import odometry_steps
-from gtsam_rwhec.runs.odometry_motions import odometry_pairs
-from gtsam_rwhec.runs.odometry_tracks import read_odometry
+from gtsam_rwhec.runs.odometry_motions import odometry_pairs, read_odometry
 from gtsam_rwhec.runs.output_folder import check_writable
 from gtsam_rwhec.runs.pair_consensus import ConsensusOptions, find_consensus
 from gtsam_rwhec.runs.run_log import RunLog, read_cleaning_report, write_run_log

@@ -59,15 +59,8 @@ def late_clocks(
 ) -> list[Finding]:
     """Findings about sensors whose rotations agree with the carriers' at another time offset than the stated one.
 
-    Parameters
-    ----------
-    pairs : dict of (target, sensor) to MeasuredPairs
-        Measurements, none of them marked as an outlier yet.
-    path : Trajectory
-        T_sensorcarrier_targetcarrier over time.
-    rig : Rig
-    stated_s : dict of sensor to float
-        The stated offsets, seconds.
+    ``pairs`` has measurements of which none is marked as an outlier yet, ``path`` T_sensorcarrier_targetcarrier over
+    time, and ``stated_s`` the stated offsets by sensor, seconds.
     """
     findings = []
     for sensor, stated in stated_s.items():

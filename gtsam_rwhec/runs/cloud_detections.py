@@ -95,16 +95,9 @@ def detect_in_clouds(
 ) -> CloudDetections:
     """Register the clouds of a sensor; what `kept` has of the same clouds and poses is not registered again.
 
-    Nor is `registered`, which is of clouds of this log, if it is of as many at the same poses.
-
-    Raises
-    ------
-    LogError
-        The topic has no clouds, or depth images without intrinsics; or no cloud can be used.
-    StampError
-        As `check_order`.
-    CloudError
-        As `seen_object`: views do not overlap, or too few are left.
+    Nor is `registered`, which is of clouds of this log, if it is of as many at the same poses. Raises `LogError` if the
+    topic has no clouds, or depth images without intrinsics, or no cloud can be used; `StampError` as `check_order`;
+    `CloudError` as `seen_object`: views do not overlap, or too few are left.
     """
     section = rig.sensors[sensor]
     topic, target, frame = section.clouds, rig.object, rig.frame_of(sensor)
@@ -157,12 +150,7 @@ def detect_in_clouds(
 def motion_by_clouds(log: Log, rig: Rig, sensor: str, progress: Progress) -> tuple[list[PoseRecord], list[CloudRecord]]:
     """The poses of a LiDAR that knows its motion by its own sweeps, on its `odometry_topic`, and maps that these make.
 
-    Raises
-    ------
-    CloudError
-        As `odometry`: too few sweeps can be registered.
-    StampError
-        As `check_order`.
+    Raises `CloudError` as `odometry`: too few sweeps can be registered; `StampError` as `check_order`.
     """
     source = rig.odometries[sensor].odometry
     assert source.clouds is not None

@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from gtsam_rwhec.cameras.camera import Camera
 from gtsam_rwhec.errors import LogError, OptionError
@@ -20,7 +20,7 @@ from gtsam_rwhec.rig.odometry_sections import odometry_topic
 from gtsam_rwhec.runs.carrier_motion import read_carrier_motion
 from gtsam_rwhec.runs.image_pictures import draw_images, has_images, write_contact_sheet
 from gtsam_rwhec.runs.kept_detections import KeptDetections, KeptOfLog
-from gtsam_rwhec.runs.odometry_tracks import records_of_files
+from gtsam_rwhec.runs.odometry_motions import records_of_files
 from gtsam_rwhec.runs.output_folder import check_is_not_read, check_writable
 from gtsam_rwhec.runs.recorded_logs import check_is_no_other_folder, is_folder_of_images, write_folder_log
 from gtsam_rwhec.runs.run_log import RECORDED_LOG, LogMetadata, RunLog, image_names, write_run_log
@@ -224,15 +224,12 @@ def detect_source(
     check_writable(sheet)
     sheet.unlink(missing_ok=True)  # one of an earlier run would be taken for this run's
     check_is_no_other_folder(source, rig)
+    how: dict[str, Any] = {"images": images, "workers": workers, "sheet": sheet, "draw": draw, "progress": progress}
     if not is_folder_of_images(source, rig):
-        return detect_log(
-            source, rig, out_path, images=images, workers=workers, sheet=sheet, draw=draw, progress=progress
-        )
+        return detect_log(source, rig, out_path, **how)
     folder = Path(source)
     rig = rig.model_copy(update={"folder": folder})
     with TemporaryDirectory(prefix=".images-", dir=Path(out_path).resolve().parent) as temporary:
         recorded = Path(temporary) / f"{folder.resolve().name}{RECORDED_LOG}"
         write_folder_log(folder, rig, recorded, progress=progress)
-        return detect_log(
-            recorded, rig, out_path, images=images, workers=workers, sheet=sheet, draw=draw, progress=progress
-        )
+        return detect_log(recorded, rig, out_path, **how)

@@ -6,6 +6,7 @@ from collections import Counter, defaultdict
 from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass, replace
 from itertools import groupby
+from typing import Any
 
 import numpy as np
 
@@ -216,7 +217,7 @@ def problem_of(
     free = {*free_sizes, *(name for name, one in rig.odometries.items() if one.odometry.scale == "estimate")}
     problem = Problem("per_target" if free else "known")
     noise = rig.noise
-    stated: dict[str, object] = {}
+    stated: dict[str, Any] = {}
     if noise != "estimate" and noise.rotation_deg is not None and noise.translation_mm is not None:
         stated = {"sigma": 1e-3 * noise.translation_mm, "kappa": 1.0 / (2.0 * np.radians(noise.rotation_deg) ** 2)}
     has_covariances = all(measured.covariance is not None for measured in pairs.values())
@@ -226,35 +227,23 @@ def problem_of(
         used = measured.used
         if not used.any():
             continue
+        A, B = measured.A[used], measured.B[used]
+        covariances = None if measured.covariance is None else measured.covariance[used]
+        stamps_ns = measured.stamps_ns[used] + round(1e9 * offsets_s.get(pair.sensor, 0.0))
+        given: dict[str, Any] = {"stamps_ns": stamps_ns, "source": "the cleaned log"}
         if pair.is_motion:
-            problem.add_motion(
-                pair.sensor,
-                measured.A[used],
-                measured.B[used],
-                stamps_ns=measured.stamps_ns[used] + round(1e9 * offsets_s.get(pair.sensor, 0.0)),
-                covariances=measured.covariance[used] if measured.covariance is not None else None,
-                source="the cleaned log",
-            )
+            problem.add_motion(pair.sensor, A, B, covariances=covariances, **given)
             continue
         weights, is_of_clouds = stated, pair.target == rig.object
         if is_of_clouds or (not stated and has_covariances):  # clouds slide on each other, whatever the rig file states
-            assert measured.covariance is not None
-            weights = {"covariances": measured.covariance[used]}
+            weights = {"covariances": covariances}
         elif not stated and noise != "estimate":
             raise NoiseError(
                 f"{pair}: noise: {{corner_px: ...}} needs corners, and the detections of {pair.sensor} are poses "
                 "without a covariance; give rotation_deg and translation_mm, or estimate"
             )
         try:
-            problem.add(
-                *pair,
-                measured.A[used],
-                measured.B[used],
-                stamps_ns=measured.stamps_ns[used] + round(1e9 * offsets_s.get(pair.sensor, 0.0)),
-                source="the cleaned log",
-                directional=is_of_clouds,
-                **weights,  # type: ignore[arg-type]
-            )
+            problem.add(pair.target, pair.sensor, A, B, directional=is_of_clouds, **given, **weights)
         except NoiseError as error:
             raise NoiseError(
                 f"{error}. The covariances are the log's; to replace them, give noise: {{rotation_deg: ..., "

@@ -19,7 +19,7 @@ from gtsam_rwhec.logs import Log
 from gtsam_rwhec.results.log_history import RemovalReason, Removed
 from gtsam_rwhec.rig import Rig
 from gtsam_rwhec.runs.measured_pairs import MeasuredPairs
-from gtsam_rwhec.runs.odometry_tracks import read_odometry
+from gtsam_rwhec.runs.odometry_motions import read_odometry
 
 #: A step is a jump if its velocity differs from the mean of its neighbours' by this many robust standard deviations.
 JUMP = 12.0

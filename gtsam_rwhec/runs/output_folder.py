@@ -159,9 +159,8 @@ class OutputFolder:
             self._kept.close()
         if isinstance(error, KeyboardInterrupt):
             error.add_note(self._how_to_go_on())
-        with suppress(
-            *(() if error is None else (OSError, RwhecError))
-        ):  # the error itself is said, not what follows it
+        # An error itself is said, not what follows it.
+        with suppress(*(() if error is None else (OSError, RwhecError))):
             self._bring_list_up_to_date(error)
         if error is None:
             (self.path / DETECTIONS).unlink(missing_ok=True)

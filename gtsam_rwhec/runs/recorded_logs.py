@@ -272,10 +272,8 @@ def samples_problem(path: str | Path) -> SamplesProblem:
     if samples.is_on_hand is not None:
         on_hand, why = samples.is_on_hand, "as the file says"
     elif samples.is_of_carriers:
-        on_hand, why = (
-            True,
-            ("which the file does not say: with a fixed camera the answer is the same, with base and hand exchanged"),
-        )
+        on_hand = True
+        why = "which the file does not say: with a fixed camera the answer is the same, with base and hand exchanged"
     else:
         # whoever calibrates this problem says it again
         with warnings.catch_warnings(action="ignore", category=NotUniqueWarning):

@@ -158,12 +158,7 @@ class LogMetadata:
 
     def entries(self) -> dict[str, dict[str, str]]:
         """The metadata records of a log, by name."""
-        cameras = {
-            sensor: json.dumps(
-                {"width": c.width, "height": c.height, "model": c.model, "K": c.K.tolist(), "D": c.D.tolist()}
-            )
-            for sensor, c in self.cameras.items()
-        }
+        cameras = {sensor: json.dumps(camera.numbers) for sensor, camera in self.cameras.items()}
         entries = {
             RIG_METADATA: {"yaml": rig_text(self.rig)},
             CAMERAS_METADATA: cameras,

@@ -31,6 +31,7 @@ from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.logs import ImageRecord, IntrinsicsRecord, Log
 from gtsam_rwhec.logs.records import INTRINSICS_SCHEMAS
 from gtsam_rwhec.rig import Rig
+from gtsam_rwhec.rig.guessed_boards import usual_lens
 from gtsam_rwhec.rig.sections import Intrinsics
 from gtsam_rwhec.runs.carrier_motion import CarrierMotion
 from gtsam_rwhec.runs.image_pictures import write_contact_sheet
@@ -142,7 +143,7 @@ def _from_topic(log: Log, topic: str, sensor: str) -> Camera:
             raise CameraError(f"sensor {sensor}: topic {topic} has no intrinsics but {type(record).__name__}s")
         camera = Camera.of(record.width, record.height, record.model, record.K, record.D, f"topic {topic}")
         first = first or camera
-        if _numbers(camera) != _numbers(first):
+        if camera.numbers != first.numbers:
             raise CameraError(
                 f"sensor {sensor}, topic {topic}: intrinsics change at {record.stamp_ns} ns (K from "
                 f"{first.K.tolist()} to {camera.K.tolist()}). After a change of zoom or resolution a camera counts as "
@@ -166,17 +167,10 @@ def _warn_of_a_fold(camera: Camera, sensor: str) -> None:
         )
 
 
-def _numbers(camera: Camera) -> tuple[object, ...]:
-    """All that two cameras share if they are the same to the last digit."""
-    return camera.width, camera.height, camera.model, camera.K.tolist(), camera.D.tolist()
-
-
 #: This many of a sensor's images are searched at first, and this many times as many if they show too few boards.
 FIRST, TIMES = 16, 4
 #: With fewer views than this, the first camera also uses those that were rejected because distortion bends them.
 FEW = 6
-#: The focal length of a usual lens over the width.
-USUAL = 0.87
 #: These rejections depend on poses, and so on intrinsics.
 ABOUT_POSES = (Rejection.NO_POSE, Rejection.REPROJECTION, Rejection.GRAZING)
 
@@ -261,7 +255,7 @@ def _of_images(
 ) -> EstimatedIntrinsics | NotEstimated:
     """Search some images with a pinhole; while boards are few, search more with a camera from the boards so far."""
     total = message_count(log, topic)
-    camera = pinhole = _camera(size)
+    camera = pinhole = usual_lens(size).camera
     found: dict[int, DetectedImage] = {}
     searched: set[int] = set()
 
@@ -361,10 +355,3 @@ def _without_poses(image: DetectedImage) -> DetectedImage:
     if image.found is None:
         return image
     return replace(image, found=replace(image.found, detections=tuple(map(plain, image.found.detections))))
-
-
-def _camera(size: Size) -> Camera:
-    """A pinhole of a usual focal length whose axis is in the middle of the image."""
-    width, height = size
-    K = [[USUAL * width, 0.0, 0.5 * (width - 1)], [0.0, USUAL * width, 0.5 * (height - 1)], [0.0, 0.0, 1.0]]
-    return Camera.of(width, height, "pinhole", K, (), "in place of the camera")

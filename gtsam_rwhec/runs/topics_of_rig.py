@@ -13,13 +13,11 @@ from gtsam_rwhec.logs.ros2_messages import DETECTIONS
 from gtsam_rwhec.rig import Rig
 from gtsam_rwhec.runs.run_log import detections_topic, is_from_stage, pairs_topic
 
+_IMAGES = ("sensor_msgs/Image", "sensor_msgs/CompressedImage", "foxglove.RawImage", "foxglove.CompressedImage")
 #: The types of messages that are read, by what the rig file takes from them.
 READ = {
-    "images": ("sensor_msgs/Image", "sensor_msgs/CompressedImage", "foxglove.RawImage", "foxglove.CompressedImage"),
-    "clouds": (
-        "sensor_msgs/PointCloud2", "foxglove.PointCloud", "sensor_msgs/Image", "sensor_msgs/CompressedImage",
-        "foxglove.RawImage", "foxglove.CompressedImage",
-    ),
+    "images": _IMAGES,
+    "clouds": ("sensor_msgs/PointCloud2", "foxglove.PointCloud", *_IMAGES),
     "detections": (*DETECTIONS, TAG_DETECTIONS),
     "intrinsics": ("sensor_msgs/CameraInfo", "foxglove.CameraCalibration"),
     "poses": (
@@ -40,10 +38,8 @@ def check_topics(log: Log, rig: Rig) -> None:
     there = {topic.name for topic in log.topics()}
     _check_types(log, rig)
     for path, topic in named_topics(rig):
-        if topic not in there and path[-2:] != (
-            "intrinsics",
-            "topic",
-        ):  # the reader of intrinsics says what else there is
+        # What else there is of intrinsics, their reader says.
+        if topic not in there and path[-2:] != ("intrinsics", "topic"):
             file = log.files[0].path
             if is_from_stage(log):
                 raise LogError(
@@ -80,13 +76,8 @@ def _check_types(log: Log, rig: Rig) -> None:
     for path, name in named:
         topic = of_topic.get(name)
         if topic is not None and topic.unreadable:
-            what = (
-                "poses"
-                if path[0] == "carriers" or path[-2:] == ("odometry", "topic")
-                else "intrinsics"
-                if path[-1] == "topic"
-                else str(path[-1])
-            )
+            has_poses = path[0] == "carriers" or path[-2:] == ("odometry", "topic")
+            what = "poses" if has_poses else str(path[-2] if path[-1] == "topic" else path[-1])
             can = [each.name for each in of_topic.values() if each.schema.replace("/msg/", "/") in READ[what]]
             raise LogError(
                 f"{rig.source.place(path)}: {log.files[0].path}, topic {name}: {topic.unreadable}. The types of {what} "

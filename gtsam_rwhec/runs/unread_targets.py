@@ -14,9 +14,10 @@ from contextlib import suppress
 import numpy as np
 
 from gtsam_rwhec.cameras.camera import Camera
-from gtsam_rwhec.cameras.targets import FAMILIES, Checkerboard, CircleGrid, Tag, Target, is_same_print
+from gtsam_rwhec.cameras.targets import FAMILIES, Checkerboard, CircleGrid, Target, is_same_print
 from gtsam_rwhec.detect.clues import About, Clue, clues, edge_blur_px, motion_blur_px
 from gtsam_rwhec.detect.detections import Rejection
+from gtsam_rwhec.detect.detector import shortest_side_px
 from gtsam_rwhec.detect.images import Gray, decode_gray
 from gtsam_rwhec.errors import ImageError
 from gtsam_rwhec.files.terminal_text import some
@@ -232,7 +233,7 @@ def of_rejections(
         if len(those) < MOSTLY * len(records):
             continue
         said = f"{len(those)} of {len(records)} detections"
-        sides = [_side_px(target, r.corners_px) for _, r in those if r.corners_px is not None]
+        sides = [shortest_side_px(target, r.corners_px) for _, r in those if r.corners_px is not None]
         off_px = [r.reprojection_px for _, r in those if r.reprojection_px is not None]
         match reason:
             case Rejection.SMALL if sides:
@@ -279,12 +280,6 @@ def nothing_explains(targets: Sequence[Target], found: Mapping[str, SensorDetect
         f"{', '.join(names)}: some images were searched for {them} with {' and '.join(tried)}, enlarged, brightened "
         f"and made smaller, and that did not help.{rejected} Does an image show {them}, whole and in focus?"
     )
-
-
-def _side_px(target: Target, corners: np.ndarray) -> float:
-    if isinstance(target, Tag):
-        return float(np.linalg.norm(np.roll(corners, -1, axis=0) - corners, axis=1).min())
-    return float(np.ptp(corners, axis=0).min())
 
 
 #: A message names at most this many tags that belong to no target.

@@ -300,10 +300,9 @@ def _verified(
         for name in found.sensors
         if name in new.cameras
     }
-    return replace(
-        found,
-        sensors={name: replace(check, held_px=_median(pixels.get(name))) for name, check in found.sensors.items()},
-    )
+    held_px = {name: float(np.median(errors)) for name, errors in pixels.items() if len(errors)}
+    sensors = {name: replace(check, held_px=held_px.get(name)) for name, check in found.sensors.items()}
+    return replace(found, sensors=sensors)
 
 
 def _is_solved_in(log: Log, result: Result) -> bool:
@@ -372,7 +371,3 @@ def pixel_errors(
         lengths = np.linalg.norm(projected - pixels, axis=2)
         found.append(lengths[np.isfinite(lengths)])
     return np.concatenate(found) if found else np.zeros(0)
-
-
-def _median(errors: Array | None) -> float | None:
-    return None if errors is None or not len(errors) else float(np.median(errors))

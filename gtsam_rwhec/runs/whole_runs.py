@@ -15,9 +15,9 @@ from gtsam_rwhec.files.progress import Progress, Remark, silent
 from gtsam_rwhec.files.terminal_text import shown_path
 from gtsam_rwhec.files.whole_files import write_atomically
 from gtsam_rwhec.geometry.blas_threads import one_blas_thread
-from gtsam_rwhec.logs import Log, open_log
+from gtsam_rwhec.logs import Log, LogWriter, PoseRecord, open_log
 from gtsam_rwhec.logs.mcap_writer import Images
-from gtsam_rwhec.results.result_file import result_json
+from gtsam_rwhec.results.result_file import parse_result, result_json
 from gtsam_rwhec.rig import Rig
 from gtsam_rwhec.rig.exported_files import FILES, FOLDERS, export_all
 from gtsam_rwhec.rig.folder_contents import cloud_folders, is_folder_without_logs
@@ -28,6 +28,7 @@ from gtsam_rwhec.runs.detection_stage import check_image_options, detected
 from gtsam_rwhec.runs.image_pictures import has_images
 from gtsam_rwhec.runs.kept_detections import inputs_of
 from gtsam_rwhec.runs.log_evidence import Pictures, frames_of, write_report
+from gtsam_rwhec.runs.measured_pairs import read_pairs, write_pairs
 from gtsam_rwhec.runs.output_folder import (
     WRITTEN,
     OutputFolder,
@@ -48,17 +49,23 @@ from gtsam_rwhec.runs.recorded_logs import (
 )
 from gtsam_rwhec.runs.run_log import (
     CALIBRATION_LOG,
+    CERTIFICATE_METADATA,
     CLEANING_METADATA,
     RECORDED_LOG,
     RESULT_FILE,
     SEEN_SHEET,
+    SOLUTION_TOPIC,
+    LogMetadata,
+    image_names,
     is_from_stage,
+    read_cameras,
     read_embedded_rig,
     read_metadata,
+    records_of,
+    write_up_to_detection,
 )
 from gtsam_rwhec.runs.sensor_detections import image_count
 from gtsam_rwhec.runs.sensor_intrinsics import check_intrinsics_files
-from gtsam_rwhec.runs.solved_log import read_solved, write_solved
 from gtsam_rwhec.runs.solving_stage import Calibrated, Solved, solve_log
 
 if TYPE_CHECKING:
@@ -146,8 +153,9 @@ def calibrate_log(
         )
     check_is_no_other_folder(log_path, rig)
     choices = _Choices(images, workers, anyway, report_images)
-    if rig is None and isinstance(log_path, str | Path) and _is_folder_of_clouds(Path(log_path)):
-        rig, registered = _proposed(Path(log_path), progress or silent)
+    folder = Path(log_path) if rig is None and isinstance(log_path, str | Path) else None
+    if folder is not None and is_folder_without_logs(folder) and cloud_folders(folder):
+        rig, registered = _proposed(folder, progress or silent)
         choices = replaced(choices, registered=registered)
     if rig is not None and (is_folder_of_images(log_path, rig) or is_file_of_samples(log_path, rig)):
         source = Path(str(log_path))
@@ -187,10 +195,6 @@ def log_of_files(source: Path, out: str | Path, *, replace: bool) -> Iterator[tu
             yield output, recorded
         finally:
             recorded.unlink(missing_ok=True)
-
-
-def _is_folder_of_clouds(path: Path) -> bool:
-    return is_folder_without_logs(path) and bool(cloud_folders(path))
 
 
 def _proposed(folder: Path, tell: Progress) -> tuple[Rig, SeenObject | None]:
@@ -334,3 +338,66 @@ def _export(solved: Solved, out: Path, *, anyway: bool, progress: Progress | Non
         written = export_all(frames_of(solved), out)
     remove_unchanged(out, FOLDERS, keep=written)
     return written
+
+
+#: A calibrated frame's name gets this ending if the raw log has transforms of a frame with the same name.
+CALIBRATED = "_calibrated"
+
+
+def write_solved(log: Log, calibrated: Calibrated, out_path: str | Path, *, result: bytes, images: Images) -> None:
+    """Write a log with its solution: frames as static transforms, certificate as metadata, result attached.
+
+    `log` is the cleaned log, whose file may be `out_path`, the MCAP file to write; `images` says whether its images are
+    written too. Raises `LogError` if the file cannot be written.
+    """
+    rig, refined, pairs = calibrated.rig, calibrated.refined, calibrated.pairs.values()
+    with LogWriter(out_path) as out:
+        write_up_to_detection(log, out, images)
+        write_pairs(out, pairs)
+        first_ns = min(int(measured.stamps_ns.min()) for measured in pairs)
+        raw = [t.name for t in log.topics() if t.is_tf and not t.unreadable and t.name != SOLUTION_TOPIC]
+        taken = {record.child for record in records_of(log, raw, PoseRecord)}
+        frames = [(rig.carriers.sensors, rig.frame_of(name), pose.matrix()) for name, pose in refined.Y.items()]
+        frames += [(rig.carriers.targets, name, pose.matrix()) for name, pose in refined.X.items()]
+        # A calibrated frame gets a name of its own if the raw log has one of its name.
+        named = [(parent, child + CALIBRATED if child in taken else child, T) for parent, child, T in frames]
+        out.transforms(SOLUTION_TOPIC, first_ns, named)
+        history = calibrated.log
+        LogMetadata(rig, calibrated.cameras, history.detection, history.cleaning, image_names(log)).write(out)
+        certificate = refined.solution.certificate
+        out.metadata(
+            CERTIFICATE_METADATA,
+            {
+                "status": certificate.status.value,
+                "objective": str(certificate.objective),
+                "cost": repr(certificate.cost),
+                "lower_bound": repr(certificate.lower_bound),
+                "relative_gap": repr(certificate.relative_gap),
+                "free_directions": "; ".join(map(str, refined.free_directions)),
+            },
+        )
+        out.attachment(RESULT_FILE, "application/json", result, first_ns)
+
+
+def read_solved(path: str | Path) -> Solved:
+    """Read the log that `write_solved` wrote.
+
+    Raises
+    ------
+    LogError
+        The log has no result in it, or a result that is not of its measurements.
+    """
+    with open_log(path) as log:
+        content = log.attachment(RESULT_FILE)
+        if content is None:
+            raise LogError(f"{path} has no {RESULT_FILE} attached: gtsam-rwhec solve or calibrate did not write it")
+        result = parse_result(content, f"{path}, attachment {RESULT_FILE}")
+        if result.log is None or result.refined is None:
+            raise LogError(f"{path}, attachment {RESULT_FILE}: it is not the refined calibration of a log")
+        rig = read_embedded_rig(log)
+        refined, pairs = result.refined, read_pairs(log, rig)
+    strangers = [*(set(refined.X) - set(rig.targets)), *(set(refined.Y) - set(rig.all_sensors))]
+    if strangers or not pairs:
+        why = f"frames that its rig file lacks: {', '.join(sorted(strangers)[:10])}" if strangers else "no measurements"
+        raise LogError(f"{path} has a {RESULT_FILE}, and {why}: they are not of one calibration")
+    return Solved(refined, result.solution, pairs, result.log, read_cameras(log), rig, result.judgement)

@@ -233,12 +233,8 @@ def bipartite_edges(
 
     ``"complete"``: every sensor sees every target. ``"star"``: the fewest edges that connect all frames, all at sensor
     0 or at target 0. ``"random"``: a random spanning tree, and every other edge with probability `edge_probability`.
-    Given edges keep their order; they may leave unconnected parts, and frames without an edge.
-
-    Raises
-    ------
-    OptionError
-        For a negative count, an unknown kind, an edge given twice or out of range, or a probability outside [0, 1].
+    Given edges keep their order; they may leave unconnected parts, and frames without an edge. Raises `OptionError` for
+    a negative count, an unknown kind, an edge given twice or out of range, or a probability outside [0, 1].
     """
     if targets < 0 or sensors < 0:
         raise OptionError(f"graph: {targets} targets and {sensors} sensors; counts cannot be negative")

@@ -66,11 +66,16 @@ def track(
 TRACKS = [track(seed) for seed in range(5)]
 
 
-def test_images_alone_are_wrong_often_and_tracks_are_not() -> None:
+def wrong_and_sure(*, with_carrier: bool) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Of all images: whether the first candidate is wrong, whether the chosen one is, and whether it is sure."""
     alone = np.concatenate([it.wrong(np.zeros(100, dtype=int)) for it in TRACKS])
-    choices = [it.choice() for it in TRACKS]
+    choices = [it.choice(with_carrier=with_carrier) for it in TRACKS]
     wrong = np.concatenate([it.wrong(choice.which) for it, choice in zip(TRACKS, choices, strict=True)])
-    sure = np.concatenate([choice.margin > SURE for choice in choices])
+    return alone, wrong, np.concatenate([choice.margin > SURE for choice in choices])
+
+
+def test_images_alone_are_wrong_often_and_tracks_are_not() -> None:
+    alone, wrong, sure = wrong_and_sure(with_carrier=True)
     assert alone.mean() > 0.2
     assert wrong.mean() < 0.01
     assert sure.mean() > 0.8
@@ -89,10 +94,7 @@ def test_carriers_link_images_that_are_far_apart_in_time() -> None:
 
 
 def test_without_carriers_neighbouring_images_help() -> None:
-    alone = np.concatenate([it.wrong(np.zeros(100, dtype=int)) for it in TRACKS])
-    choices = [it.choice(with_carrier=False) for it in TRACKS]
-    wrong = np.concatenate([it.wrong(choice.which) for it, choice in zip(TRACKS, choices, strict=True)])
-    sure = np.concatenate([choice.margin > SURE for choice in choices])
+    alone, wrong, sure = wrong_and_sure(with_carrier=False)
     assert wrong.mean() < 0.35 * alone.mean()
     assert wrong[sure].mean() < 0.05
 

@@ -20,8 +20,8 @@ import gtsam
 import numpy as np
 import pytest
 import synthetic_logs as made
-from given_commands import given
-from places import CELL, DEMO
+from given_commands import command, given
+from places import CELL, DEMO, REPOSITORY
 from typer.testing import CliRunner
 from web_server import served
 
@@ -377,3 +377,16 @@ def test_types_that_the_next_step_does_not_read_are_named(tmp_path: Path) -> Non
 def test_of_many_types_the_first_are_named(tmp_path: Path) -> None:
     others = [made.Message(f"/of_{i}", f"nav.Thing{i:02d}", {}, made.BEGIN_NS) for i in range(MOST_NAMED + 2)]
     assert "and 2 more; they are kept" in messages_not_read(made.write(tmp_path / "log.mcap", others))
+
+
+CELL = REPOSITORY / "data" / "cell"
+
+
+def test_a_robot_that_never_stands_still_leaves_no_calibration_and_says_so(tmp_path: Path) -> None:
+    status, said = command(
+        "live", CELL / "eye_to_hand.mcap", "--rig", CELL / "eye_to_hand.yaml", "-o", tmp_path / "cell", "--when-still",
+        "--terminal", "--speed", "20",
+    )  # fmt: skip
+    assert status == 3, said
+    assert "Nothing was taken: the robot never stood still" in " ".join(said.split())
+    assert not (tmp_path / "cell" / "calibration").exists()

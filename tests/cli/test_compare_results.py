@@ -57,19 +57,21 @@ def test_the_verdict_is_the_first_line_and_the_status(folder: Path, new: str, st
     assert "\x1b" not in text
 
 
+def write_csv(folder: Path, one: rw.Measurements, target: int = 0) -> None:
+    """The measurements of one camera and one target as a folder of CSV files."""
+    folder.mkdir()
+    for side, poses in (("A", one.A), ("B", one.B)):
+        q = [gtsam.Rot3(T[:3, :3]).toQuaternion() for T in poses]
+        rows = [[each.w(), each.x(), each.y(), each.z(), *T[:3, 3]] for each, T in zip(q, poses, strict=True)]
+        np.savetxt(folder / f"tag_{target}_cam_0_{side}.csv", rows, delimiter=",")
+
+
 def test_a_calibration_of_csv_files_is_verified_on_others(folder: Path, tmp_path: Path) -> None:
     """The calibration of a folder of CSV files, and one more folder: the camera was knocked in between."""
-    done = []
     for name, log in (("old", log_of(0)), ("new", log_of(2, knocked="left"))):
-        (tmp_path / name).mkdir()
-        one = log.measurements("board", "left")
-        for side, poses in (("A", one.A), ("B", one.B)):
-            q = [gtsam.Rot3(T[:3, :3]).toQuaternion() for T in poses]
-            rows = [[each.w(), each.x(), each.y(), each.z(), *T[:3, 3]] for each, T in zip(q, poses, strict=True)]
-            np.savetxt(tmp_path / name / f"tag_0_cam_0_{side}.csv", rows, delimiter=",")
+        write_csv(tmp_path / name, log.measurements("board", "left"))
     rw.write_calibration(rw.calibrate(rw.read_csv(tmp_path / "old")), tmp_path / "old.json")
-    for name in ("old", "new"):
-        done.append(given("verify", tmp_path / "old.json", tmp_path / name))
+    done = [given("verify", tmp_path / "old.json", tmp_path / name) for name in ("old", "new")]
     assert [one.exit_code for one in done] == [ExitStatus.DONE, ExitStatus.CHANGED], done[1].output
     assert done[1].stdout.startswith("The calibration no longer holds: ")
     refused = given("verify", tmp_path / "old.json", "log.mcap")
@@ -189,12 +191,8 @@ def test_the_answer_of_touches_stays_where_other_commands_read_the_result(folder
 
 def test_a_board_in_other_csv_files_accepts_a_calibration_of_csv_files(tmp_path: Path) -> None:
     for name, log in (("old", log_of(0)), ("new", log_of(1, count=40))):
-        (tmp_path / name).mkdir()
         one = log.measurements("board" if name == "old" else "tag", "left")
-        for side, poses in (("A", one.A), ("B", one.B)):
-            q = [gtsam.Rot3(T[:3, :3]).toQuaternion() for T in poses]
-            rows = [[each.w(), each.x(), each.y(), each.z(), *T[:3, 3]] for each, T in zip(q, poses, strict=True)]
-            np.savetxt(tmp_path / name / f"tag_{len(name) + len(log.pairs)}_cam_0_{side}.csv", rows, delimiter=",")
+        write_csv(tmp_path / name, one, len(name) + len(log.pairs))
     result = tmp_path / "result.json"
     done = given("calibrate", str(tmp_path / "old"), "-o", str(result))
     assert done.exit_code == ExitStatus.DONE, done.output

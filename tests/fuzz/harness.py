@@ -23,6 +23,13 @@ class Harness:
     limit_s: float = 10.0  #: Seconds of the processor that one input may take
 
 
+def check_said(found: Iterable[object]) -> None:
+    """What a decoder gave for each message can be shown: records, or why there are none in a sentence."""
+    for each in found:
+        assert not isinstance(each, str) or len(each) < 5000, f"a sentence of {len(each)} characters"
+        str(each)
+
+
 def scratch() -> Path:
     """A new folder, which `run.py` puts into memory and deletes: files are written for every input."""
     return Path(tempfile.mkdtemp(prefix="fuzz-"))

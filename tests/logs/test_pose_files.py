@@ -95,16 +95,6 @@ TEXTS = {
 }  # fmt: skip
 
 
-@pytest.mark.parametrize("name", sorted(TEXTS))
-def test_each_form_gives_the_same_poses(tmp_path: Path, name: str) -> None:
-    text, stated = TEXTS[name]
-    (tmp_path / name).write_text(text)
-    found = read_poses(tmp_path / name, PoseStatement(**stated))
-    np.testing.assert_allclose(found.T, T, atol=1e-9)
-    if "im_0" in text:
-        assert list(found.names) == NAMES
-
-
 def test_names_of_matrices_and_stamps(tmp_path: Path) -> None:
     for name in ("ros.yaml", "euroc.csv", "tum.txt"):
         (tmp_path / name).write_text(TEXTS[name][0])
@@ -277,12 +267,14 @@ PRINTED = {
 }  # fmt: skip
 
 
-@pytest.mark.parametrize("name", sorted(PRINTED))
-def test_what_programs_print(tmp_path: Path, name: str) -> None:
-    text, stated = PRINTED[name]
+@pytest.mark.parametrize("name", sorted(TEXTS | PRINTED))
+def test_each_form_gives_the_same_poses(tmp_path: Path, name: str) -> None:
+    text, stated = (TEXTS | PRINTED)[name]
     (tmp_path / name).write_text(text)
     found = read_poses(tmp_path / name, PoseStatement(**stated))
     np.testing.assert_allclose(found.T, T, atol=1e-9)
+    if name in TEXTS and "im_0" in text:
+        assert list(found.names) == NAMES
     if name in ("topic_echo.yaml", "two_parts.csv"):
         assert found.names == tuple(str(1_700_000_000 * 10**9 + i) for i in range(4))
     if name == "topic_echo.yaml":

@@ -11,6 +11,7 @@ import json
 from pathlib import Path
 
 import numpy as np
+from rwhec_factors.se3 import pose
 from scipy.spatial.transform import Rotation
 
 from gtsam_rwhec.methods import opencv
@@ -20,22 +21,16 @@ GOLDEN = Path(__file__).parents[1] / "golden" / "opencv_4_hand_eye.json"
 CASES = {"wide": (1, 0.01, 0.005, None), "narrow": (2, 1e-3, 1e-3, 0.6), "noisy": (3, 0.05, 0.02, 1.0)}
 
 
-def transforms(R, t):
-    T = np.zeros((len(R), 4, 4))
-    T[:, :3, :3], T[:, :3, 3], T[:, 3, 3] = R, t, 1.0
-    return T
-
-
 def stations(count, seed, noise_rad=0.01, noise_m=0.005, spread_rad=None):
     """Gripper in base, target in camera (N, 4, 4), and the true camera in gripper and target in base (4, 4)."""
     rng = np.random.default_rng(seed)
-    camera, target = transforms(Rotation.random(2, random_state=rng).as_matrix(), rng.normal(size=(2, 3)) * 0.3)
+    camera, target = pose(Rotation.random(2, random_state=rng).as_matrix(), rng.normal(size=(2, 3)) * 0.3)
     if spread_rad is None:
         turns = Rotation.random(count, random_state=rng)
     else:
         turns = Rotation.from_rotvec(spread_rad * rng.normal(size=(count, 3)))
-    gripper = transforms(turns.as_matrix(), 0.5 * rng.normal(size=(count, 3)))
-    noise = transforms(
+    gripper = pose(turns.as_matrix(), 0.5 * rng.normal(size=(count, 3)))
+    noise = pose(
         Rotation.from_rotvec(noise_rad * rng.normal(size=(count, 3))).as_matrix(), noise_m * rng.normal(size=(count, 3))
     )
     seen = np.linalg.inv(camera) @ np.linalg.inv(gripper) @ target @ noise

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from rwhec_factors.se3 import pose
 from scipy.spatial.transform import Rotation
 
 Array = NDArray[np.float64]
@@ -19,11 +20,7 @@ class Simulated:
 
 
 def poses(rotvecs: Array, translations: Array) -> Array:
-    T = np.zeros((len(rotvecs), 4, 4))
-    T[:, :3, :3] = Rotation.from_rotvec(rotvecs).as_matrix()
-    T[:, :3, 3] = translations
-    T[:, 3, 3] = 1.0
-    return T
+    return pose(Rotation.from_rotvec(rotvecs).as_matrix(), translations)
 
 
 def perturbed(T: Array, sigma_rad: float, sigma_m: float, rng: np.random.Generator) -> Array:

@@ -3,7 +3,8 @@
 import cv2
 import numpy as np
 import pytest
-from hand_eye_stations import METHODS, ROBOT_WORLD, SHAPES, largest_difference, parts, stations, transforms
+from hand_eye_stations import METHODS, ROBOT_WORLD, SHAPES, largest_difference, parts, stations
+from rwhec_factors.se3 import pose
 from scipy.spatial.transform import Rotation
 
 from gtsam_rwhec.methods import opencv
@@ -26,8 +27,8 @@ def test_hand_eye_agrees_with_the_installed_opencv(method, eye):
 def stations_to_hand(gripper, seed):
     """Target in a fixed camera, the target being on the gripper."""
     rng = np.random.default_rng(seed)
-    camera, target = transforms(Rotation.random(2, random_state=rng).as_matrix(), rng.normal(size=(2, 3)))
-    noise = transforms(Rotation.from_rotvec(0.01 * rng.normal(size=(len(gripper), 3))).as_matrix(), np.zeros(3))
+    camera, target = pose(Rotation.random(2, random_state=rng).as_matrix(), rng.normal(size=(2, 3)))
+    noise = pose(Rotation.from_rotvec(0.01 * rng.normal(size=(len(gripper), 3))).as_matrix(), np.zeros(3))
     return np.linalg.inv(camera) @ gripper @ target @ noise
 
 

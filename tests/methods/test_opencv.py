@@ -6,9 +6,10 @@ import json
 
 import numpy as np
 import pytest
-from hand_eye_stations import CASES, GOLDEN, METHODS, ROBOT_WORLD, largest_difference, parts, stations, transforms
+from hand_eye_stations import CASES, GOLDEN, METHODS, ROBOT_WORLD, largest_difference, parts, stations
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from rwhec_factors.se3 import pose
 from scipy.spatial.transform import Rotation
 
 from gtsam_rwhec import simulate, solve
@@ -68,7 +69,7 @@ def test_exact_poses_give_both_truths(method, seed, count):
 def test_the_answer_does_not_depend_on_where_the_base_and_the_target_are(method):
     gripper, seen, _, _ = stations(15, 4)
     rng = np.random.default_rng(0)
-    base, target = transforms(Rotation.random(2, random_state=rng).as_matrix(), 1e3 * rng.normal(size=(2, 3)))
+    base, target = pose(Rotation.random(2, random_state=rng).as_matrix(), 1e3 * rng.normal(size=(2, 3)))
     if method == opencv.CALIB_HAND_EYE_CERTIFIED:  # errors of the measured rotation would move another origin
         target[:3, 3] = 0.0
     first = opencv.calibrateHandEye(*parts(gripper, seen), method=method)
@@ -236,7 +237,7 @@ def test_integers_and_lists_of_lists_are_numbers():
 def poses_of(turns: np.ndarray, places: np.ndarray) -> list[np.ndarray]:
     """Rotations and translations of a gripper, and of the target that its camera sees."""
     G, X, W = (
-        transforms(Rotation.from_rotvec(turn).as_matrix(), place)
+        pose(Rotation.from_rotvec(turn).as_matrix(), place)
         for turn, place in ((turns, places), ([[0.4, -0.2, 0.9]], [[0.1, 0.2, 0.3]]), ([[1, 2, 3]],) * 2)
     )
     C = np.linalg.inv(X) @ np.linalg.inv(G) @ W

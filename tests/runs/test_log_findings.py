@@ -171,15 +171,20 @@ def test_other_readings_are_said_beside_an_exchange() -> None:
     assert of_B.cure.startswith("let the driver publish the target's pose")
 
 
-def test_a_drivers_corners_outside_of_its_images_leave_the_poses_in_doubt(tmp_path: Path) -> None:
-    """Intrinsics of another resolution, or a driver that makes corners up: its poses had no answer at all."""
+def with_intrinsics() -> str:
+    """The rig file with the topics of its cameras' intrinsics."""
     text = made.RIG
     for camera in made.CAMERAS:
         topic = f"detections: /{camera}/tags"
         text = text.replace(topic, f"{topic}\n    intrinsics: {{topic: /{camera}/camera_info}}")
+    return text
+
+
+def test_a_drivers_corners_outside_of_its_images_leave_the_poses_in_doubt(tmp_path: Path) -> None:
+    """Intrinsics of another resolution, or a driver that makes corners up: its poses had no answer at all."""
     low = {"height": 400}  # the made-up tags are seen beyond the borders too
     messages = [*(made.camera_info(camera, **low) for camera in made.CAMERAS), *made.recording(2.5)]
-    calibrated = made.solved(tmp_path, messages, text)
+    calibrated = made.solved(tmp_path, messages, with_intrinsics())
     assert calibrated.refined.reprojection is None
     assert rw.Ground.CORNERS_DOUBTED in calibrated.judgement.grounds
     assert "outside images of 640 x 400 pixels" in calibrated.judgement.reason
@@ -188,10 +193,7 @@ def test_a_drivers_corners_outside_of_its_images_leave_the_poses_in_doubt(tmp_pa
 
 def test_corners_counterclockwise_as_of_the_apriltag_library_give_the_same_answer(tmp_path: Path) -> None:
     """Poses read them clockwise, and the refinement as they came: it had tags upside down, to 0.1 pixel."""
-    text = made.RIG
-    for camera in made.CAMERAS:
-        topic = f"detections: /{camera}/tags"
-        text = text.replace(topic, f"{topic}\n    intrinsics: {{topic: /{camera}/camera_info}}")
+    text = with_intrinsics()
     wide = {"width": 1600, "height": 1200, "K": [400.0, 0.0, 800.0, 0.0, 400.0, 600.0, 0.0, 0.0, 1.0]}
     messages = [made.camera_info(camera, **wide) for camera in made.CAMERAS]
     for message in made.recording(2.5):
