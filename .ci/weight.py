@@ -37,7 +37,7 @@ BUDGET = {
     # a LiDAR beside poses of a vehicle 20; many tags by what does not change 90
     # clouds by a wrong focal length 110, in another unit or given twice 50
     # errors that last 30; an arm's stated accuracy 80; poses logged late, copies, mounts that slipped 200; LiDARs 20
-    # a late clock that is less than sure, scales that run away, drifts that do not pay, regions of moments, short logs 55
+    # a late clock that is less than sure, scales that run away, drifts that do not pay, regions, short logs 55
     "lines": 101_905,
     "code": 63_540,
     # capture has 25 files, and is a package of its own
