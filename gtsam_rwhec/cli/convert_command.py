@@ -17,16 +17,10 @@ from gtsam_rwhec.files.terminal_text import say, shown_path, some
 Columns = Literal["tx ty tz qx qy qz qw", "tx ty tz qw qx qy qz", "qw qx qy qz tx ty tz", "qx qy qz qw tx ty tz"]
 
 
-NOT_FOR_A_BAG = {
-    "only for a folder of images with --poses. Add --poses FILE, or leave the option out.": frozenset(
-        {"columns", "parent", "child", "camera"}
-    )
-}
-NOT_WITH_A_RIG = {
-    "not with --rig, whose file states it. Leave one of them out.": frozenset(
-        {"poses", "columns", "parent", "child", "camera"}
-    )
-}
+#: Parameters that count beside a file of poses.
+OF_POSES = frozenset({"columns", "parent", "child", "camera"})
+NOT_FOR_A_BAG = {"only for a folder of images with --poses. Add --poses FILE, or leave the option out.": OF_POSES}
+NOT_WITH_A_RIG = {"not with --rig, whose file states it. Leave one of them out.": OF_POSES | {"poses"}}
 
 
 def convert(

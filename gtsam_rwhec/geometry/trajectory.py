@@ -76,18 +76,12 @@ class Trajectory:
         outside = (stamps_ns < self.stamps_ns[0]) | (stamps_ns > self.stamps_ns[-1])
         return before, after, np.where(outside, np.inf, (self.stamps_ns[after] - self.stamps_ns[before]) * 1e-9)
 
-    def speeds(self) -> tuple[Array, Array]:
-        """Angular (rad/s) and linear (m/s) speed at each pose, (N,): the faster of the steps before and after it."""
-        if len(self.T) < 2:
-            return np.zeros(len(self.T)), np.zeros(len(self.T))
-        seconds = np.diff(self.stamps_ns) * 1e-9
-        step = se3.inverse(self.T[:-1]) @ self.T[1:]
-        turning = np.linalg.norm(se3.so3_logmap(step[:, :3, :3]), axis=1) / seconds
-        moving = np.linalg.norm(step[:, :3, 3], axis=1) / seconds
-        return (
-            np.maximum(np.r_[turning, turning[-1]], np.r_[turning[0], turning]),
-            np.maximum(np.r_[moving, moving[-1]], np.r_[moving[0], moving]),
-        )
+    def speeds(self, stamps_ns: np.ndarray, side_ns: int) -> tuple[Array, Array]:
+        """Angular (rad/s) and linear (m/s) speeds (M,) at stamps, by differences over `side_ns` to both sides."""
+        before, after = self.at(stamps_ns - side_ns)[0], self.at(stamps_ns + side_ns)[0]
+        step, seconds = se3.inverse(before) @ after, 2e-9 * side_ns
+        turning = np.linalg.norm(se3.so3_logmap(step[:, :3, :3]), axis=1)
+        return turning / seconds, np.linalg.norm(step[:, :3, 3], axis=1) / seconds
 
 
 def increasing_stamps(stamps_ns: ArrayLike, count: int, where: str) -> np.ndarray:

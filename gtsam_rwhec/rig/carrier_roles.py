@@ -362,11 +362,8 @@ def rest_of(image_ns: np.ndarray, path: Trajectory) -> Rest:
         return Rest(True, f"poses are {rounded(apart_s, 2)} s apart: the robot stopped for each image")
     if not len(inside):
         return Rest(False, "no image is within the poses' time")
-    before, after = path.at(inside - SIDE_NS)[0], path.at(inside + SIDE_NS)[0]
-    step = se3.inverse(before) @ after
-    seconds = 2e-9 * SIDE_NS
-    slow = np.linalg.norm(step[:, :3, 3], axis=1) / seconds < REST_M_S
-    slow &= np.linalg.norm(se3.so3_logmap(step[:, :3, :3]), axis=1) / seconds < REST_RAD_S
+    turning, moving = path.speeds(inside, SIDE_NS)
+    slow = (moving < REST_M_S) & (turning < REST_RAD_S)
     share = float(slow.mean())
     said = f"the carrier stood still at {int(slow.sum())} of {len(slow)} images"
     return Rest(share >= MOST, said)

@@ -7,7 +7,6 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from rwhec_factors import se3
 
 from gtsam_rwhec.errors import LogError, LogWarning, StampError
 from gtsam_rwhec.files.progress import Progress, silent
@@ -140,7 +139,7 @@ def clean_track(track: MeasuredPairs, path: Trajectory, rig: Rig, offset_s: floa
     stamps = pairs.stamps_ns
     if options.max_rotation_deg_s is not None or options.max_translation_m_s is not None:
         at = np.flatnonzero(pairs.used)
-        turning, moving = speeds(path, stamps[at] + round(1e9 * offset_s))
+        turning, moving = path.speeds(stamps[at] + round(1e9 * offset_s), SPEED_STEP_NS)
         turning_limit_deg_s, moving_limit_m_s = (
             np.inf if limit is None else limit for limit in (options.max_rotation_deg_s, options.max_translation_m_s)
         )
@@ -167,18 +166,6 @@ def clean_track(track: MeasuredPairs, path: Trajectory, rig: Rig, offset_s: floa
         found = find_consensus(A[at], pairs.B[at], stamps[at], ConsensusOptions(scale_known=rig.sizes == "known"))
         pairs = pairs.marked(found.kept, at)
     return pairs
-
-
-def speeds(path: Trajectory, stamps_ns: np.ndarray) -> tuple[Array, Array]:
-    """How fast the carriers turn (rad/s) and move (m/s) at stamps (N,), by central differences of their path."""
-    before, _ = path.at(stamps_ns - SPEED_STEP_NS)
-    after, _ = path.at(stamps_ns + SPEED_STEP_NS)
-    step = se3.inverse(before) @ after
-    seconds = 2e-9 * SPEED_STEP_NS
-    return (
-        np.linalg.norm(se3.so3_logmap(step[:, :3, :3]), axis=1) / seconds,
-        np.linalg.norm(step[:, :3, 3], axis=1) / seconds,
-    )
 
 
 def _time_offset(rig: Rig, sensor: str, path: Trajectory, tracks: list[MeasuredPairs]) -> tuple[float, float | None]:
