@@ -240,7 +240,7 @@ def _smoothed(points: Array, outwards: Array) -> Array:
     for _ in range(2):
         same = np.einsum("nki,ni->nk", outwards[near], outwards) > ALONG
         outwards = np.einsum("nk,nki->ni", same, outwards[near])
-        outwards /= np.linalg.norm(outwards, axis=1, keepdims=True)
+        outwards /= np.maximum(np.linalg.norm(outwards, axis=1, keepdims=True), 1e-12)
     return outwards
 
 
