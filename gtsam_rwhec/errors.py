@@ -59,7 +59,7 @@ class UnderdeterminedError(RwhecError):
 
 
 class ScaleError(RwhecError):
-    """A scale is not positive, in the input or at the optimum."""
+    """A scale is not positive, in the input or at the optimum, or the motion does not tell it."""
 
     page = "docs/calibrate.md#what-it-does-in-order"
 

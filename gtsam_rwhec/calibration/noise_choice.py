@@ -10,7 +10,7 @@ import numpy as np
 from gtsam_rwhec.calibration.calibrate_options import CalibrateOptions, Inliers, Run, agreeing, offsets_of
 from gtsam_rwhec.calibration.outliers import SPARE_EQUATIONS, spare_equations
 from gtsam_rwhec.calibration.verdict import REFINEMENT, Ground
-from gtsam_rwhec.errors import CountError, NoiseError, UnderdeterminedError
+from gtsam_rwhec.errors import CountError, NoiseError, ScaleError, UnderdeterminedError
 from gtsam_rwhec.files.progress import Progress
 from gtsam_rwhec.files.terminal_text import rounded
 from gtsam_rwhec.fitting.fit_options import ArmAccuracy, Component, NoiseOptions, RefineOptions
@@ -193,10 +193,10 @@ def refined_under_its_noise(
             refined = replace(refined, inliers=inliers)
         else:
             refined, noise, inliers = estimated(run.problem, solution, inliers, run.options, run.tell)
-    except (NoiseError, CountError, UnderdeterminedError) as error:
+    except (NoiseError, CountError, ScaleError, UnderdeterminedError) as error:
         record.choose(REFINEMENT, "none", f"the noise cannot be found: {error}")
         words = f"the {number} measurements are too few to tell how well the poses are known"
-        record.find(Ground.NO_COVARIANCE, str(error) if isinstance(error, UnderdeterminedError) else words)
+        record.find(Ground.NO_COVARIANCE, str(error) if isinstance(error, ScaleError) else words)
         return None, NOT_KNOWN, solution, inliers
     spare = spare_equations(agreeing(run.problem, inliers))
     if run.options.noise == "given" or refined.noise_source == "given":

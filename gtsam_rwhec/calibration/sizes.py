@@ -285,8 +285,8 @@ def _under_all_noise(
         kinds = NoiseOptions(drift=walk or "none", side=like.hand, systematic=like.arms_assumed)
     try:
         refined, noise = refine_under_noise(free, start, options, kinds, progress=progress)
-    except (CountError, UnderdeterminedError, np.linalg.LinAlgError, RuntimeError):
-        return []  # harmless: the jackknife tests them
+    except (CountError, ScaleError, np.linalg.LinAlgError, RuntimeError):
+        return []  # harmless: the jackknife tests the sizes
     # where drift is untried, errors of neighbours in time are alike, and the deviations do not know it
     return [] if noise.is_drift_untried else sizes_in(refined)
 

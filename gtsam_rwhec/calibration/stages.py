@@ -97,7 +97,7 @@ def of_turning(
     if not found:
         return []
     most = max(found, key=lambda one: float(one.spread_rad[1]))
-    reasons = {direction.reason for direction in free}
+    reasons = {direction.reason for direction in free} - {FreeReason.SLIDES}  # which is of the thing, not of the motion
     if FreeReason.NO_ROTATION in reasons:
         return [Finding(Ground.NOT_UNIQUE, "too little rotation: the carriers hardly turn")]
     if FreeReason.ONE_AXIS in reasons:

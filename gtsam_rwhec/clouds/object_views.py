@@ -274,7 +274,9 @@ def _moved(views: Views, view: int, off_m: float) -> ViewFinding:
 def _apart(views: Views, view: int) -> ViewFinding:
     """The finding of a view that overlaps no other of the group."""
     turns = se3.so3_logmap((views.A @ se3.inverse(views.A[view]))[:, :3, :3])
-    near = np.argsort(np.linalg.norm(turns, axis=1))[1:3]
+    far = np.linalg.norm(turns, axis=1)
+    far[view] = np.inf
+    near = np.argsort(far)[:2]
     names = tuple(views.surfaces[k].name for k in near)
     return ViewFinding(int(views.at[view]), views.surfaces[view].name, ViewFault.APART, 0.0, names)
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.special import fdtri
 
-from gtsam_rwhec.errors import CountError, UnderdeterminedError
+from gtsam_rwhec.errors import CountError, ScaleError
 from gtsam_rwhec.files.progress import Progress, silent
 from gtsam_rwhec.fitting.block_agreement import scatter_of_blocks, too_much
 from gtsam_rwhec.fitting.clock_rates import clocks_with_rate, rates_found
@@ -114,7 +114,7 @@ def under_noise(
     ------
     CountError
         There are too few measurements for such a model, or so many that it does not fit into memory.
-    UnderdeterminedError
+    ScaleError
         Under that noise a scale runs away from the certified one.
     """
     how, options, tell = how or RefineOptions(noise="estimate"), options or NoiseOptions(), progress or silent
@@ -148,7 +148,7 @@ def under_noise(
         if max(scale / first, first / scale) > RUNAWAY:
             of = f"the scale of {unknown.owner}" if unknown.owner else "the scale"
             words = f"it went from {first:.3g} to {scale:.3g} under the noise that the residuals show"
-            raise UnderdeterminedError(f"the motion does not tell {of}: {words}")
+            raise ScaleError(f"the motion does not tell {of}: {words}")
     return UnderNoise(task, found, solution, how)
 
 

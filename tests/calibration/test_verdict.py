@@ -16,6 +16,7 @@ import gtsam_rwhec as rw
 from gtsam_rwhec.calibration.stages import turning_of
 from gtsam_rwhec.calibration.verdict import Finding, Ground, Judgement, Verdict
 from gtsam_rwhec.geometry.poses import Array
+from gtsam_rwhec.problem.directions import SLID
 from gtsam_rwhec.simulate.simulated_noise import random_poses
 
 
@@ -132,6 +133,18 @@ def test_the_verdict_says_how_the_carriers_turned(
     judgement = calibrated(turns_deg, ways_m).judgement
     assert judgement.grounds == (ground,)
     assert words in judgement.reason
+
+
+def test_a_thing_that_slides_does_not_hide_that_the_carriers_hardly_turned() -> None:
+    """A cylinder from one direction was of use, with the sensor 46 mm off."""
+    rng = np.random.default_rng(3)
+    X, Y = random_poses(2, 0.4, rng)
+    A = expmap(rng.normal(size=(COUNT, 6)) * np.repeat([np.radians(1.0), 0.1], 3))
+    of_ball = np.diag(np.r_[np.full(3, SLID), NOISE[3:] ** 2])
+    problem = rw.Problem()
+    B = inverse(Y[None]) @ A @ X @ expmap(np.r_[0.0, 0.0, 0.0, NOISE[3:]] * rng.standard_normal((COUNT, 6)))
+    problem.add("ball", "camera", A, B, covariances=np.tile(of_ball, (COUNT, 1, 1)), directional=True)
+    assert rw.Ground.LITTLE_ROTATION in rw.calibrate(problem).judgement.grounds
 
 
 def test_a_good_motion_is_not_accused() -> None:
