@@ -369,6 +369,37 @@ def moved_at_the_end(refined: Refined, measured: Mapping[Pair, Measured]) -> Two
     return None
 
 
+#: By chance neighbours are so much alike with this probability at most, as of so many draws. Among more measurements
+#: than these, outliers come in bursts, and those that were kept tell of drift.
+ALIKE_BY_CHANCE, DRAWS, MOST_ALIKE = 1e-3, 5000, 39
+
+
+def outliers_drift(refined: Refined, measured: Mapping[Pair, Measured]) -> bool:
+    """Whether outliers are off as their neighbours are, in the axes of targets or of sensors: they drift or moved.
+
+    The test is von Neumann's. The sum of the squared steps from each measurement's residual to the next is compared
+    with those in other orders and with other signs, which are as likely if wrong measurements have nothing to do with
+    one another. Not so in a stream, where neighbours are one view of a target.
+    """
+    chance = np.random.default_rng(0)
+    sums = np.zeros((2, DRAWS + 1))  # of each side: as measured, and as drawn
+    for pair, one in measured.items():
+        n, both = len(one.kept), residual_twists(refined, pair, one.A, one.B)
+        if n > MOST_ALIKE or one.kept.all() or not one.kept.any() or not len(both[0]):
+            continue
+        poses = one.A[:, :3].reshape(n, -1)
+        nearest = np.asarray(cKDTree(poses).query(poses, k=2)[1])[:, 1]
+        if (np.abs(nearest - np.arange(n)) == 1).mean() > 0.5:
+            continue
+        order = np.vstack([np.arange(n), chance.permuted(np.tile(np.arange(n), (DRAWS, 1)), axis=1)])
+        signs = np.vstack([np.ones((1, n, 2)), chance.choice([-1.0, 1.0], (DRAWS, n, 2))])[..., None]
+        for side, of in enumerate(both):
+            near = np.maximum(np.median(_sizes(of[one.kept]), axis=0), LEAST)
+            parts = of.reshape(n, 2, 3) / near[:, None]
+            sums[side] += (np.diff(signs * parts[order], axis=1) ** 2).sum(axis=(1, 2, 3))
+    return bool(((sums[:, 1:] <= sums[:, :1]).mean(axis=1) < ALIKE_BY_CHANCE).any())
+
+
 #: So many outliers of two mixed sensors agree on the second, and this share of all: boards' turns may be wrong. Where
 #: the second camera's lens is another one, they agree within a share of their angle and distance only, but most do.
 FEWEST_MIXED = 3

@@ -23,11 +23,13 @@ from gtsam_rwhec.calibration.moved_frames import (
     mixed_sensors,
     moved_at_the_end,
     moved_with_outliers,
+    outliers_drift,
     residuals_at_stations,
     step_of,
     two_poses,
 )
 from gtsam_rwhec.calibration.noise_choice import estimated
+from gtsam_rwhec.calibration.outliers import Outliers, contradicted_frames
 from gtsam_rwhec.calibration.row_shifts import between_rows
 from gtsam_rwhec.calibration.sizes import TargetSize, common_factor, sizes
 from gtsam_rwhec.calibration.verdict import Ground
@@ -172,7 +174,12 @@ def doubt_one_pose(run: Run, refined: Refined, inliers: Inliers) -> dict[str, Ar
     found = found or moved_at_the_end(refined, measured) or mixed_sensors(refined, measured)
     if found is not None:
         run.record.find(Ground.MIXED if found.by_turns else Ground.MOVED, str(found))
-    elif not run.problem.directed and (late := between_rows(refined, measured)) is not None:
+        return {}
+    outliers = Outliers.of(run.problem, inliers)
+    if not contradicted_frames(outliers.counts) and outliers_drift(refined, measured):
+        alike = "were left out, but are off in the same way as their neighbours: a frame drifts or moved"
+        run.record.find(Ground.CORRELATED, f"{outliers.by_pair} {alike}")
+    if not run.problem.directed and (late := between_rows(refined, measured)) is not None:
         if late.chance <= DOUBTFUL_CHANCE:
             run.record.find(Ground.LATE_POSES, str(late))
         return late.moves

@@ -304,3 +304,30 @@ def test_the_row_is_that_of_all_measurements_with_those_that_were_left_out() -> 
     assert found is not None
     assert found.from_row == 32
     assert found.first + found.second == kept.sum()
+
+
+def drifting(seed: int, *, is_drift: bool) -> rw.Problem:
+    """Ten to eighteen measurements: the first quarter drifts, or a quarter at random places is wrong."""
+    chance = np.random.default_rng(seed)
+    count = int(chance.integers(10, 19))
+    X, Y = poses(chance, 2, 1.0, 0.4)
+    A = poses(chance, count, 1.0, 0.4)
+    B = inverse(Y) @ A @ X @ poses(chance, count, 2e-4, 1e-4)
+    if is_drift:
+        steps = np.where(np.arange(count)[:, None] < count // 4, 8e-4 * chance.normal(size=(count, 6)), 0.0)
+        B = B @ se3.expmap(np.cumsum(steps[::-1], axis=0)[::-1])
+    else:
+        wrong = chance.choice(count, count // 4, replace=False)
+        B[wrong] = B[wrong] @ poses(chance, len(wrong), 0.02, 0.01)
+    return problem_of(A, B)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_outliers_that_are_off_as_their_neighbours_are_drift(seed: int) -> None:
+    """The drifting end of a track was three to four outliers: USE, and ellipsoids of what stood still later."""
+    judgement = rw.calibrate(drifting(seed, is_drift=True)).judgement
+    assert judgement.grounds == (rw.Ground.CORRELATED,)
+    assert "off in the same way as their neighbours" in judgement.reason
+    calibration = rw.calibrate(drifting(seed, is_drift=False))
+    assert calibration.outliers.number >= 2
+    assert calibration.verdict is rw.Verdict.USE
