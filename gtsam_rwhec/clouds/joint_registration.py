@@ -28,7 +28,7 @@ from gtsam_rwhec.problem.directions import SEEN
 ROUNDS = 4
 #: Poses that move less than this (share of the spacing, at the thing) have settled.
 SETTLED = 1e-3
-#: Views are loose together where so many times the variance of each among the others is not known.
+#: Groups of views err together where all know a direction so many times worse than each among the others.
 LOOSE = 1.3
 #: Rounding, in shares of what each view among the others knows.
 NOTHING = 1e-9

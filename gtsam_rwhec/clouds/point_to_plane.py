@@ -25,7 +25,7 @@ SHARED = (0.2, 0.5)
 #: The same of one view among many.
 SHARED_BY_VIEWS = (0.1, 0.5)
 #: The same of groups of views that only edges link: one sees the end of a surface where the other sees a crease, and
-#: all of their edges are off alike. (In simulation by a third of their deviations; real sensors lose ends.)
+#: all of their edges are off alike. In simulation it is a third of their deviations; real sensors do not see every end.
 SHARED_BY_GROUPS = (0.1, 0.7)
 #: Information of a direction counts if it is so many of its own deviations above zero.
 SIGNIFICANT = 4.0
