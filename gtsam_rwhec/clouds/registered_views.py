@@ -120,7 +120,8 @@ class ViewFinding:
                 "others: its unit of length is another, or it shows nothing"
             )
         if self.fault is ViewFault.SAME:
-            return f"{self.name} has the same points as {', '.join(self.neighbours)}: one cloud is stored twice, and has one pose only"
+            others = ", ".join(self.neighbours)
+            return f"{self.name} has the same points as {others}: one cloud is stored twice, and has one pose only"
         return (
             f"{self.name} overlaps no view of the others where its pose puts it (nearest by rotation: "
             f"{', '.join(self.neighbours)}): it sees another side, the thing moved, or the pose is of another view"
