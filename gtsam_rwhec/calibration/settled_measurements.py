@@ -68,9 +68,11 @@ def settled_measurements(run: Run) -> tuple[Run, tuple[TargetSize, ...], Corners
     if not looks_at_sizes and not _asked(problem, run) and run.recording is None:
         return run, (), None
     sizes: tuple[TargetSize, ...] = ()
-    # Lengths in clouds count as right: the first fits have no noise of A, beside which registrations contradict them.
-    measured = {pair.target for pair in problem.pairs if pair not in problem.directed}
-    targets = [name for name in problem.targets if name in measured and name not in _estimated(problem)]
+    targets = [name for name in problem.targets if name not in _estimated(problem)]
+    if options.sizes == "correct":
+        # Not those of clouds: the first fits have no noise of A, beside which registrations contradict their lengths.
+        measured = {pair.target for pair in problem.pairs if pair not in problem.directed}
+        targets = [name for name in targets if name in measured]
     now = _Settled(problem, dict(run.moved_s))
     if looks_at_sizes and targets:
         run.tell("looking at the targets' sizes")

@@ -146,13 +146,16 @@ def test_right_clouds_are_not_stretched(shape: Shape, noise_m: float) -> None:
     assert np.isinf(found.sigma) == (noise_m == 1e-3)
 
 
-def test_lengths_in_clouds_are_never_corrected() -> None:
+def test_lengths_in_clouds_are_estimated_only_if_asked_for() -> None:
     """By the command, a first fit without noise of A made right clouds of a box 1 % longer, without a word."""
     made = clouds_of_thing("box", 12, 7, noise_in_A=Noise(sigma_m=3e-4, kappa=0.5 / np.radians(0.1) ** 2))
     problem = rw.Problem()
     seen_object(made.clouds, made.A).add_to(problem, "thing", "camera")
-    options = rw.CalibrateOptions(sizes="correct", time_offsets=False)
-    assert rw.calibrate(problem, options, recording=Recording()).refined.scale == 1.0
+    scales = [
+        rw.calibrate(problem, rw.CalibrateOptions(sizes=sizes, time_offsets=False), recording=Recording()).scale
+        for sizes in ("correct", "estimate")
+    ]
+    assert scales[0] == 1.0 != scales[1]
 
 
 def test_groups_of_views_that_little_links_claim_no_more_than_all_views_together() -> None:
