@@ -205,7 +205,7 @@ class WeightsWarning(RwhecWarning):
 
 
 class OutliersWarning(RwhecWarning):
-    """Fewer than half of a frame's measurements, or of all measurements, agree with the rest."""
+    """Fewer than half of a frame's measurements, or of all, agree with the rest; or views of a thing are left out."""
 
 
 class NotConvergedWarning(RwhecWarning):

@@ -246,12 +246,13 @@ _ADVICE = {
     Ground.INTRINSICS_UNCERTAIN: _CALIBRATE_INTRINSICS,
     Ground.SHAPE_UNCERTAIN: _MEASURE_BOARD,
     Ground.SIZE_UNCERTAIN: (
-        'measure the named target with a caliper, or let its size be estimated: rw.Problem(scale="per_target") or '
-        "--scale per_target (in a rig file: sizes: estimate)"
+        "measure the named target with a caliper (of clouds: a known length with the sensor), or let its size be "
+        'estimated: rw.Problem(scale="per_target"), of clouds "shared", or --scale per_target (in a rig file: sizes: '
+        "estimate)"
     ),
     Ground.SIZE_UNTOLD: (
-        'measure the named target with a caliper, state what it is, and say that it is known: sizes="known" (in a rig '
-        "file: sizes: known), or measure it from other distances too"
+        "measure the named target with a caliper (of clouds: a known length with the sensor), state it, and say that "
+        'it is known: sizes="known" (in a rig file: sizes: known), or measure from other distances too'
     ),
     Ground.CLOUDS_STRETCHED: (
         "calibrate the intrinsics of the named 3D camera at this resolution (its focal length in pixels), and make the "

@@ -130,13 +130,11 @@ def _text_table(text: bytes, dtype: np.dtype, count: int, path: Path) -> np.ndar
             f"{path} is cut: {count} points of {sum(widths)} numbers, and there are {len(numbers)} lines of "
             f"{numbers.shape[1]}"
         )
-    starts = np.cumsum([0, *widths])
-    names = dtype.names or ()
-    columns = {name: numbers[:, start] for name, start, width in zip(names, starts, widths, strict=False) if width == 1}
     table = np.zeros(count, dtype)
-    for name, column in columns.items():
-        with np.errstate(invalid="ignore"):  # nan in a field of whole numbers
-            table[name] = column
+    for name, start, width in zip(dtype.names or (), np.cumsum([0, *widths]), widths, strict=False):
+        if width == 1:
+            with np.errstate(invalid="ignore"):  # nan in a field of whole numbers
+                table[name] = numbers[:, start]
     return table
 
 

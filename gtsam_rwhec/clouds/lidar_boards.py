@@ -26,6 +26,7 @@ from gtsam_rwhec.clouds.board_rectangle import (
     rectangle_by,
 )
 from gtsam_rwhec.clouds.cloud import Cloud
+from gtsam_rwhec.clouds.shapes import plane_through
 from gtsam_rwhec.errors import CloudError, OptionError
 from gtsam_rwhec.files.terminal_text import brief
 from gtsam_rwhec.geometry.poses import Array, PoseLike, one_transform
@@ -210,24 +211,15 @@ class _Flat(NamedTuple):
         return np.where(cosines < -0.5 * GRAZING, self.offset / np.minimum(cosines, -1e-9), np.inf)
 
 
-def _plane_through(points: Array, noise_m: float) -> tuple[_Flat, np.ndarray] | None:
+def _largest_plane(points: Array, noise_m: float) -> tuple[_Flat, np.ndarray] | None:
     """The plane of most points by RANSAC, and which are on it."""
     rng = np.random.default_rng(0)
-    best: tuple[int, Array, float] = (0, np.zeros(3), 0.0)
-    for _ in range(200):
-        a, b, c = points[rng.choice(len(points), 3, replace=False)]
-        normal = np.cross(b - a, c - a)
-        length = np.linalg.norm(normal)
-        if length < 1e-4:
-            continue
-        normal = normal / length
-        offset = float(normal @ a)
-        count = int((np.abs(points @ normal - offset) < 2.5 * noise_m).sum())
-        if count > best[0]:
-            best = count, normal, offset
-    count, normal, offset = best
-    if count < FEWEST_POINTS:
+    tried = [plane_through(points[rng.choice(len(points), 3, replace=False)]) for _ in range(200)]
+    counts = [int((np.abs(points @ plane[:3] - plane[3]) < 2.5 * noise_m).sum()) for plane in tried]
+    if max(counts) < FEWEST_POINTS:
         return None
+    best = tried[int(np.argmax(counts))]
+    normal, offset = best[:3], float(best[3])
     for _ in range(3):
         on = np.abs(points @ normal - offset) < 3.0 * noise_m
         middle = points[on].mean(axis=0)
@@ -250,7 +242,7 @@ def _fitted(
 ) -> LidarBoard | str:
     """The board whose points are among the candidates, or why there is none."""
     few = f"a piece with fewer than {FEWEST_POINTS} points on a plane, by {FEWEST_BEAMS} beams"
-    found = _plane_through(beams.points[candidate], options.noise_m) if len(candidate) >= FEWEST_POINTS else None
+    found = _largest_plane(beams.points[candidate], options.noise_m) if len(candidate) >= FEWEST_POINTS else None
     if found is None:
         return few
     flat, on = found

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
@@ -29,7 +30,7 @@ from gtsam_rwhec.clouds.registered_views import (
 )
 from gtsam_rwhec.clouds.registration import Registrations, largest_group
 from gtsam_rwhec.clouds.surfaces import Spacing, Surface, size_of
-from gtsam_rwhec.errors import CloudError
+from gtsam_rwhec.errors import CloudError, OutliersWarning
 from gtsam_rwhec.geometry.poses import Array, PosesLike, as_transforms
 from gtsam_rwhec.problem.directions import centre_of_slides, shifted_and_turned, with_common_slides
 from gtsam_rwhec.problem.knowledge import Stretch
@@ -109,7 +110,8 @@ class SeenObject:
     def add_to(self, problem: Problem, target: str, sensor: str) -> None:
         """Add the views that are used to a problem, as measurements of a target.
 
-        A CloudError if clouds of another sensor have given the target a frame: each gives the thing one of its own.
+        An OutliersWarning says which are not, and why. A CloudError if clouds of another sensor have given the target a
+        frame: each gives the thing one of its own.
         """
         others = [pair.sensor for pair in problem.alike if pair.target == target and pair.sensor != sensor]
         if others:
@@ -118,6 +120,9 @@ class SeenObject:
                 f"it as a target of its own, such as {target}_{sensor}"
             )
         used = self.used
+        if self.left_out:
+            words = f"{len(self.left_out)} of {len(used)} views of {target} are left out: "
+            warnings.warn(words + "; ".join(map(str, self.left_out.values())), OutliersWarning, stacklevel=2)
         problem.add(
             target,
             sensor,
@@ -160,15 +165,15 @@ def seen_object(clouds: Iterable[Cloud], A: PosesLike, options: ObjectOptions | 
     solution of the motions, and then all at once by points to planes and edges.
     """
     options = options or ObjectOptions()
-    views, few = prepared(clouds, A, options)
-    return seen_from(views, few, as_transforms(A, None, "A"), first_pose(views, options))
+    views = prepared(clouds, A, options)
+    return seen_from(views, as_transforms(A, None, "A"), first_pose(views, options))
 
 
-def seen_from(views: Views, few: Sequence[ViewFinding], A: Array, Y: Array) -> SeenObject:
-    """As `seen_object`, of `prepared` views and those with too few points, from a pose (4, 4) that explains them."""
+def seen_from(views: Views, A: Array, Y: Array) -> SeenObject:
+    """As `seen_object`, of `prepared` views, from a pose (4, 4) that explains them."""
     registrations, Y = registered_in_turn(views, Y)
     together = largest_group(len(views.at), registrations.i, registrations.j)
-    out = [*few, *(_apart(views, int(k)) for k in np.flatnonzero(~together))]
+    out = [*views.left_out, *(_apart(views, int(k)) for k in np.flatnonzero(~together))]
     kept, place = views.selected(together), np.cumsum(together) - 1
     if len(kept.at) < FEWEST_VIEWS:
         raise CloudError(f"only {len(kept.at)} views overlap each other: " + "; ".join(map(str, out)))
@@ -224,7 +229,7 @@ def motions(clouds: Iterable[Cloud], A: PosesLike, options: ObjectOptions | None
     Arguments and errors as in `seen_object`, which is better where the sensor sees one thing: it registers all at once.
     """
     options = options or ObjectOptions()
-    views, _ = prepared(clouds, A, options)
+    views = prepared(clouds, A, options)
     registrations, Y = registered_in_turn(views, first_pose(views, options))
     check_agreement(views, registrations, Y)
     return registrations.renamed(views.at)

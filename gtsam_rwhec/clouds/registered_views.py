@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Collection, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from enum import StrEnum
 from itertools import chain, islice
@@ -20,6 +20,7 @@ from gtsam_rwhec.clouds.surfaces import (
     FINER,
     Spacing,
     Surface,
+    reachable,
     size_of,
     spacing_of,
     surface_of,
@@ -53,8 +54,13 @@ STILL = 0.05
 TINY = 1e-12
 #: Registrations that differ from the poses by more than this share of the thing's size are none of this thing.
 CONTRADICTION = 0.15
-#: Clouds of one thing differ in size by less than this factor.
-OTHER_SIZE = 100.0
+#: Clouds of one thing differ in size by less than this factor: beside one that is so large no others were registered.
+OTHER_SIZE = 15.0
+#: Numbers in the first unit are so many times as large as in the second; sizes of views tell it to a factor.
+UNITS = {1e3: ("mm", "m"), 100.0: ("cm", "m"), 39.37: ("inches", "m"), 25.4: ("mm", "inches"), 10.0: ("0.1 mm", "mm")}
+LIKE = 1.2
+#: Clouds are one if their points differ by less than this share of their distance: files round them, and order them.
+COPIED = 1e-5
 #: Poses are the same if they differ by less than this, rad and m.
 SAME = 1e-6
 #: The spacing is taken from this many views.
@@ -89,7 +95,7 @@ class ViewFault(StrEnum):
     FEW_POINTS = "few_points"
     #: It is far larger or smaller than the others: its unit of length is another.
     OTHER_SIZE = "other_size"
-    #: It is another view's cloud, point by point.
+    #: It is another view's cloud: the same points, in any order.
     SAME = "same"
 
 
@@ -97,7 +103,7 @@ class ViewFault(StrEnum):
 class ViewFinding:
     """A view that is left out, and why; ``str()`` is a sentence.
 
-    The thing was ``off_m`` elsewhere, or the view is ``off_m`` large.
+    The thing was ``off_m`` elsewhere, or the view is ``off_m`` large: ``times`` as large as most others.
     """
 
     view: int
@@ -105,6 +111,7 @@ class ViewFinding:
     fault: ViewFault
     off_m: float = 0.0
     neighbours: tuple[str, ...] = ()
+    times: float = 1.0
 
     def __str__(self) -> str:
         if self.fault is ViewFault.MOVED:
@@ -116,8 +123,8 @@ class ViewFinding:
             return f"{self.name} has too few points to tell a pose"
         if self.fault is ViewFault.OTHER_SIZE:
             return (
-                f"{self.name} shows a thing of {rounded(self.off_m)} m, a hundred times larger or smaller than in most "
-                "others: its unit of length is another, or it shows nothing"
+                f"{self.name} shows a thing of {rounded(self.off_m)} m, {rounded(self.times)} times as large as most "
+                f"others, {like_units(self.times, 'its points')} (unit_m is for all), or it shows a wall behind"
             )
         if self.fault is ViewFault.SAME:
             others = ", ".join(self.neighbours)
@@ -128,19 +135,29 @@ class ViewFinding:
         )
 
 
+def like_units(times: float, what: str) -> str:
+    """In which unit lengths may be that are so many times as large as others, and by what to multiply ``what``."""
+    unit = min(UNITS, key=lambda each: abs(abs(np.log(times)) - np.log(each)))
+    if abs(abs(np.log(times)) - np.log(unit)) > np.log(LIKE):
+        return "perhaps in another unit of length"
+    one, other = UNITS[unit][:: 1 if times > 1.0 else -1]
+    return f"like {one} beside {other}: multiply {what} by {rounded(1.0 / unit if times > 1.0 else unit, 4)}"
+
+
 @dataclass(frozen=True)
 class Views:
-    """Views that have a surface: their places among all, surfaces, and A of these."""
+    """Views that have a surface: their places among all, surfaces, and A of these; and those that are left out."""
 
     at: np.ndarray
     surfaces: Sequence[Surface]
     A: Array
     spacing: Spacing
+    left_out: Sequence[ViewFinding]
 
     def selected(self, mask: np.ndarray) -> Views:
         """The views where ``mask`` is true."""
         surfaces = [each for each, yes in zip(self.surfaces, mask, strict=True) if yes]
-        return Views(self.at[mask], surfaces, self.A[mask], self.spacing)
+        return replace(self, at=self.at[mask], surfaces=surfaces, A=self.A[mask])
 
     def posed(self, A: PosesLike) -> Views:
         """The same surfaces at other A of all views that were given."""
@@ -152,26 +169,24 @@ def _checked(A: PosesLike) -> Array:
     return rows_to_transforms(checked_rows(transforms, 0, "A").rows) if len(transforms) else transforms
 
 
-def prepared(clouds: Iterable[Cloud], A: PosesLike, options: ObjectOptions) -> tuple[Views, list[ViewFinding]]:
-    """The surfaces of all views, and those that have too few points."""
+def prepared(clouds: Iterable[Cloud], A: PosesLike, options: ObjectOptions) -> Views:
+    """The surfaces of all views, but for those that have too few points, another unit, or another view's cloud."""
     transforms = _checked(A)
     given = Cloud.each(clouds)
     first = list(islice(given, SPACED))
-    spacing = Spacing(0.0, 0.0, 0.0)
-    if len(transforms):
-        spacing = spacing_of([each.points for each in first], len(transforms))
+    count = len(transforms)
+    spacing = spacing_of([each.points for each in first], count) if count else Spacing(0.0, 0.0, 0.0)
     if options.spacing_m is not None:
         spacing = Spacing(options.spacing_m, spacing.edges_m and options.spacing_m / FINER, spacing.noise_m)
-    surfaces, few = [], []
+    surfaces, marks = [], []
     for view, cloud in enumerate(chain(first, given)):
-        surface = surface_of(cloud, f"view {view}" + (f" ({cloud.source})" if cloud.source else ""), spacing)
-        if len(surface.faces.points) < FEWEST_POINTS:
-            few.append(ViewFinding(view, surface.name, ViewFault.FEW_POINTS))
-        surfaces.append(surface)
+        surfaces.append(surface_of(cloud, cloud.source or f"clouds[{view}]", spacing))
+        marks.append(_mark(reachable(cloud.points)))
     if len(surfaces) != len(transforms):
         raise CloudError(f"{len(surfaces)} clouds and {len(transforms)} poses in A; give one A for each cloud")
-    _check_different(surfaces, transforms)
-    few += _strangers(surfaces, transforms, {each.view for each in few})
+    if len(transforms) > 1 and np.abs(se3.logmap(se3.inverse(transforms[:1]) @ transforms[1:])).max() < SAME:
+        raise CloudError(f"all {len(surfaces)} poses are the same: nothing moved, so nothing tells where the sensor is")
+    few = _left_out(surfaces, np.array(marks), transforms) if surfaces else []
     at = np.setdiff1d(np.arange(len(surfaces)), [each.view for each in few])
     if len(at) < FEWEST_VIEWS:
         raise CloudError(
@@ -179,38 +194,36 @@ def prepared(clouds: Iterable[Cloud], A: PosesLike, options: ObjectOptions) -> t
             "are good" + "".join(f"; {each}" for each in few)
         )
     kept = without_border([surfaces[k] for k in at], GATE * spacing.faces_m)
-    return Views(at, kept, transforms[at], spacing), few
+    return Views(at, kept, transforms[at], spacing, few)
 
 
-def _strangers(surfaces: Sequence[Surface], A: Array, without: Collection[int]) -> list[ViewFinding]:
-    """Views of another unit, and those that are one cloud: all of them, or all but the first where poses agree."""
-    at = [view for view in range(len(surfaces)) if view not in without]
-    sizes = np.array([surfaces[view].size_m for view in at])
-    ratio = np.maximum(sizes, ONE_PLACE) / np.median(sizes) if at else sizes
-    found = [
-        ViewFinding(view, surfaces[view].name, ViewFault.OTHER_SIZE, size)
-        for view, size, of in zip(at, sizes.tolist(), ratio, strict=True)
-        if not 1.0 / OTHER_SIZE < of < OTHER_SIZE
-    ]
-    alike: dict[bytes, list[int]] = {}
-    for view in at:
-        alike.setdefault(surfaces[view].faces.points.tobytes(), []).append(view)
+def _mark(points: Array) -> Array:
+    """By which points (N, 3) are known in any order: their number, size, means and deviations, (8,)."""
+    scale = np.sqrt(len(points) / (points**2).sum(axis=1).mean())
+    size, mean, off = np.sqrt(points.var(axis=0).sum()), points.mean(axis=0), points.std(axis=0)
+    return np.asarray(np.r_[len(points), size, scale * mean, scale * off])
+
+
+def _left_out(surfaces: Sequence[Surface], marks: Array, A: Array) -> list[ViewFinding]:
+    """Views of few points or of another unit, and those that are one cloud: all, or all but the first of one pose."""
+    found: list[ViewFinding] = []
+    alike: dict[int, list[int]] = {}
+    sizes = np.maximum(marks[:, 1], ONE_PLACE)
+    for view, (surface, mark, times) in enumerate(zip(surfaces, marks, sizes / np.median(sizes), strict=True)):
+        if mark[0] >= FEWEST_POINTS and not 1.0 / OTHER_SIZE < times < OTHER_SIZE:
+            found.append(ViewFinding(view, surface.name, ViewFault.OTHER_SIZE, sizes[view], times=times))
+        elif len(surface.faces.points) < FEWEST_POINTS:
+            found.append(ViewFinding(view, surface.name, ViewFault.FEW_POINTS))
+        else:
+            alike.setdefault(int((np.abs(marks - mark) < COPIED).all(axis=1).argmax()), []).append(view)
+    if len(alike) == 1 < len(surfaces) - len(found):
+        raise CloudError(f"all {len(surfaces)} clouds are the same points; give each pose the cloud seen there")
     for views in alike.values():
         is_one_pose = np.abs(se3.logmap(se3.inverse(A[views[:1]]) @ A[views])).max() < SAME
         for view in views[1:] if is_one_pose else views if len(views) > 1 else []:
             others = tuple(surfaces[other].name for other in views if other != view)
             found.append(ViewFinding(view, surfaces[view].name, ViewFault.SAME, 0.0, others))
     return found
-
-
-def _check_different(surfaces: Sequence[Surface], A: Array) -> None:
-    """Raise a CloudError if all poses are one, or all clouds."""
-    if len(A) > 1 and np.abs(se3.logmap(se3.inverse(A[:1]) @ A[1:])).max() < SAME:
-        raise CloudError(f"all {len(A)} poses are the same: nothing moved, so nothing tells where the sensor is")
-    if len(surfaces) > 1 and all(np.array_equal(each.faces.points, surfaces[0].faces.points) for each in surfaces[1:]):
-        raise CloudError(
-            f"all {len(surfaces)} clouds are the same, point by point; give each pose the cloud seen there"
-        )
 
 
 def registered_in_turn(views: Views, Y: Array) -> tuple[Registrations, Array]:
@@ -229,7 +242,7 @@ def registered_in_turn(views: Views, Y: Array) -> tuple[Registrations, Array]:
             starts = np.array([aligned(views.surfaces, *pair, WIDE * spacing) for pair in tried])
         pairs = registered(views.surfaces, views.A, i, j, starts, predicted, GATE * spacing)
         if len(pairs) < FEWEST_VIEWS - 1:
-            raise CloudError(_no_overlap(views, i, j))
+            raise CloudError(_unexplained(views, first_poses(views.surfaces, views.A, spacing, Y)[0].misfit))
         i, j, starts = pairs.i, pairs.j, pairs.B
         before = Y
         Y, _ = certified_pose(pairs)
@@ -324,32 +337,26 @@ def first_pose(views: Views, options: ObjectOptions) -> Array:
 
 def _unexplained(views: Views, misfit: float) -> str:
     """Words for poses that explain nothing: the reading of them that would explain the clouds, if there is one."""
-    shorter, longer = views.A.copy(), views.A.copy()
-    shorter[:, :3, 3] *= 1e-3
-    longer[:, :3, 3] *= 1e3
     rows = "the poses belong to other views: with A shifted by {} row the clouds fit"
-    unit = "{} look like millimetres, and {} like metres: with A's translations times {} the clouds fit"
-    readings = {
-        rows.format("one"): np.roll(views.A, 1, axis=0),
-        rows.format("minus one"): np.roll(views.A, -1, axis=0),
-        unit.format("poses", "clouds", "0.001"): shorter,
-        unit.format("clouds", "poses", "1000"): longer,
+    points = "all points, or unit_m of the rig file,"
+    readings = {rows.format("one"): np.roll(views.A, 1, axis=0), rows.format("minus one"): np.roll(views.A, -1, axis=0)}
+    for times in (each for unit in UNITS for each in (unit, 1.0 / unit)):
+        words = f"lengths in the clouds are {rounded(times, 4)} times those of the poses, {like_units(times, points)}"
+        words += f", or A's translations by {rounded(times, 4)}, and the clouds fit"
+        readings[words] = se3.pose(views.A[:, :3, :3], times * views.A[:, :3, 3])
+    readings |= {
         "A is inverted: give T_sensorcarrier_targetcarrier, with which the clouds fit": se3.inverse(views.A),
         "most of what the clouds show does not move before the sensor (a wall, a table): cut it away, and leave the "
         "thing": np.repeat(views.A[:1], len(views.A), axis=0),
     }
+    out = "".join(f"; {each}" for each in views.left_out)
     for words, A in readings.items():
         best = first_poses(views.surfaces, A, views.spacing.faces_m)[0]
         if best.explains and best.misfit < 0.6 * misfit:
-            return words
-    names = f"{views.surfaces[0].name} to {views.surfaces[-1].name}"
+            return words + out
     return (
-        f"{names}: at no pose of the sensor on its carrier do the clouds overlap (misfit {misfit:.2f}; 0 is perfect, 1 "
-        "is apart). Look whether the thing stood still, whether A is T_sensorcarrier_targetcarrier with the right unit "
-        "and order of angles, and whether neighbouring views share a third of what they see"
+        f"{views.surfaces[0].name} to {views.surfaces[-1].name}: at no pose of the sensor on its carrier do the clouds "
+        f"overlap (misfit {misfit:.2f}; 0 is perfect, 1 is apart){out}. Look whether the thing stood still, whether A "
+        "is T_sensorcarrier_targetcarrier with the right order of angles, and whether neighbours share a third of what "
+        "they see"
     )
-
-
-def _no_overlap(views: Views, i: np.ndarray, j: np.ndarray) -> str:
-    pairs = ", ".join(f"{views.at[a]} and {views.at[b]}" for a, b in zip(i, j, strict=True))
-    return f"views do not overlap where their poses put them (tried: {pairs or 'no pair shares a fifth of its points'})"

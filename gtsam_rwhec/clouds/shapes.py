@@ -189,7 +189,7 @@ def find_plane(cloud: Cloud, *, noise_m: float | None = None) -> SeenPlane:
         raise OptionError(f"find_plane: noise_m={brief(noise_m)}; give a positive number of metres")
     points = cloud.points
     noise = noise_m or surface_noise(points)
-    _, off = _by_ransac(points, 3, _plane_through, _off_plane, noise, where, "plane")
+    _, off = _by_ransac(points, 3, plane_through, _off_plane, noise, where, "plane")
     for _ in range(10):
         used = np.abs(off) < GATE * _spread(off, noise)
         middle = points[used].mean(axis=0)
@@ -300,7 +300,7 @@ def _off_sphere(points: Array, sphere: Array) -> Array:
     return off
 
 
-def _plane_through(points: Array) -> Array:
+def plane_through(points: Array) -> Array:
     """[normal, offset] (4,) of three points; nan where they are on one line."""
     normal = np.cross(points[1] - points[0], points[2] - points[0])
     length = np.linalg.norm(normal)

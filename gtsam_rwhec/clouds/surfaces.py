@@ -150,7 +150,7 @@ def spacing_of(clouds: Iterable[Array], views: int) -> Spacing:
     own, faces, noise = [], [], []
     wanted = min(POINTS, max(FEW_POINTS, ALL_POINTS // views))
     for every in clouds:
-        points = _reachable(every)
+        points = reachable(every)
         few = points[:: max(1, len(points) // SAMPLED)]
         points = points[:: max(1, len(points) // DENSE)]
         own.append(float(np.median(neighbours_in(tree_of(points), few, 2)[0][:, 1])))
@@ -169,7 +169,7 @@ def spacing_of(clouds: Iterable[Array], views: int) -> Spacing:
 
 def surface_of(cloud: Cloud, name: str, spacing: Spacing) -> Surface:
     """A view thinned to a spacing."""
-    given = _reachable(cloud.points[:: max(1, len(cloud) // DENSE)])
+    given = reachable(cloud.points[:: max(1, len(cloud) // DENSE)])
     if spacing.is_noisy:
         smooth, off_m = _along_rays(given, np.arange(len(given)))
         given = np.where((off_m < ON_A_PLANE * np.median(off_m))[:, None], smooth, given)
@@ -179,7 +179,7 @@ def surface_of(cloud: Cloud, name: str, spacing: Spacing) -> Surface:
     return Surface(name, faces, _edges(given, spacing.edges_m, faces), native, tree)
 
 
-def _reachable(points: Array) -> Array:
+def reachable(points: Array) -> Array:
     """Without points that are far beyond all others: they are none of a thing, and no grid has room for them."""
     away = np.abs(points).max(axis=1)
     reachable: Array = points[away < REACH * np.median(away)]

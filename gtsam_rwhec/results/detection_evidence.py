@@ -171,7 +171,7 @@ def removed_list(pairs: Mapping[Pair, Marked], name_of: Callable[[str, int], str
             target=pair.target,
             sensor=pair.sensor,
             reason=reason,
-            image=f"measurement {stamp}" if span is None else name_of(pair.sensor, stamp),
+            image=f"measurement {stamp + 1}" if span is None else name_of(pair.sensor, stamp),
             time_s=None if span is None else round(1e-9 * (stamp - first), 6),
         )
         for stamp, pair, reason in found[:MOST_LISTED]
@@ -217,7 +217,7 @@ def seen_in_problem(
         removed_list=removed_list(rows, lambda sensor, stamp: str(stamp)),
         cameras=seen_cameras(rated, cameras, found),
         worst=tuple(
-            worst_image(one, str(one.view.stamp_ns) if is_stamped else f"measurement {one.view.stamp_ns}")
+            worst_image(one, str(one.view.stamp_ns) if is_stamped else f"measurement {one.view.stamp_ns + 1}")
             for one in worst_views(rated)
         ),
         no_pictures="the measurements were given without images.",

@@ -6,6 +6,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
+from itertools import product
 from pathlib import Path
 from typing import Literal
 
@@ -16,7 +17,7 @@ from gtsam_rwhec.calibration.trial_fits import ROUNDS, Spread, fitted
 from gtsam_rwhec.clouds.first_registration import first_poses
 from gtsam_rwhec.clouds.named_fields import cloud_of_record
 from gtsam_rwhec.clouds.object_views import SeenObject, seen_from
-from gtsam_rwhec.clouds.registered_views import ObjectOptions, prepared
+from gtsam_rwhec.clouds.registered_views import ObjectOptions, like_units, prepared
 from gtsam_rwhec.clouds.surfaces import spacing_of, surface_of
 from gtsam_rwhec.errors import CloudError, RigError
 from gtsam_rwhec.files.progress import Progress
@@ -55,6 +56,8 @@ LOOKED_AT = 12
 AGREES = 0.45
 #: So many of the best readings after one round of weights are fitted with all rounds.
 FITTED_WELL = 4
+#: Lengths in depth images may be so many times those of the poses: some cameras write tenths of a millimetre.
+DEPTHS = (10.0, 0.1)
 #: Another reading explains the registered clouds as well if its residuals' product is below this many times the best.
 AS_WELL = 2.0
 #: Names for the frames of a folder's poses; files do not name them.
@@ -80,12 +83,10 @@ class _Reading:
 
     def __str__(self) -> str:
         said = self.poses.stated
-        words = ["three angles"] if said.euler else ["matrices or quaternions"]
+        words = f"quaternions {said.quaternion}" if said.quaternion else "matrices or quaternions"
         if said.euler:
-            words = [f"angles {said.euler} in {said.angles}" + (" before the position" if said.columns else "")]
-        if said.quaternion:
-            words = [f"quaternions {said.quaternion}"]
-        return f"{words[0]}, {'mm' if said.length else 'm'}, the sensor on {CHILD if self.role == 'child' else PARENT}"
+            words = f"angles {said.euler} in {said.angles}" + (" before the position" if said.columns else "")
+        return f"{words}, {'mm' if said.length else 'm'}, the sensor on {CHILD if self.role == 'child' else PARENT}"
 
 
 @dataclass(frozen=True, eq=False)
@@ -240,16 +241,30 @@ def _best(
     at = np.array(list(seen))
     readings = [reading for reading in readings if np.isfinite(reading.poses.T[at]).all()]
     named = (replace(cloud, source=clouds.files[i].relative_to(folder).as_posix()) for i, cloud in seen.items())
-    views, few = prepared(named, readings[0].A[at], ObjectOptions())
+    views = prepared(named, readings[0].A[at], ObjectOptions())
     misfits = []
-    for number, reading in enumerate(readings, start=1):
+    # Where no reading lets clouds agree, depths may be in another unit, and poses of the clouds beside theirs.
+    mistakes = {"": (0, 1.0)}
+    for times in DEPTHS if clouds.size is not None else ():
+        why = f"lengths in the depth images are {times:g} times those of the poses, {like_units(times, 'unit_m')}"
+        mistakes[f"{why} (0.001 if not stated)"] = 0, times
+    row = "the poses belong to other clouds: each cloud fits the pose one row {} its own"
+    mistakes |= {row.format("before"): (1, 1.0), row.format("after"): (-1, 1.0)}
+    for (why, (rows, times)), (number, reading) in product(mistakes.items(), enumerate(readings, start=1)):
         tell(f"reading the poses as {reading} ({number} of {len(readings)})")
-        under = views.posed(reading.A[at])
+        places = np.searchsorted(posed, at) - rows
+        is_there = np.isin(places, np.arange(len(posed)))
+        A = reading.A[posed].take(places, axis=0, mode="clip")
+        if not np.isfinite(A).all() or is_there.sum() < LEAST_CLOUDS:
+            continue
+        under = views.posed(se3.pose(A[:, :3, :3], times * A[:, :3, 3])).selected(is_there[views.at])
         start, *others = first_poses(under.surfaces, under.A, under.spacing.faces_m)
         misfits.append(start.misfit)
         if start.misfit > AGREES:
             continue
-        registered = seen_from(under, few, reading.A[at], start.T_sensorcarrier_sensor)
+        if why:
+            return reading, f"{why}; with that, poses read as {reading} let the clouds agree", False, None
+        registered = seen_from(under, reading.A[at], start.T_sensorcarrier_sensor)
         used = registered.used
         residuals = [_residual(other.A[at][used], registered.T_sensor_object[used], 1) for other in readings]
         for k in sorted(range(len(readings)), key=lambda k: _product(residuals[k]))[:FITTED_WELL]:
@@ -265,15 +280,13 @@ def _best(
         second = next_best[0]
         words += f" (the next, {readings[second]}: {_figures(residuals[second])})"
         return readings[best], words, _product(residuals[second]) > AS_WELL * _product(residuals[best]), kept
-    best = int(np.argmin(misfits))
+    best = int(np.argmin(misfits[: len(readings)]))
     words = (
         f"none of {len(readings)} readings of the poses lets the clouds agree; {readings[best]} is a guess. State "
         "euler, angles, length, and which frame carries the sensor; look whether the thing stood still, and whether "
         "neighbouring clouds share a third of what they see"
     )
-    if clouds.size is not None:
-        words += ", and whether one unit of the depth images is a millimetre (else state unit_m)"
-    return readings[best], words, False, None
+    return readings[best], "; ".join([*map(str, views.left_out), words]), False, None
 
 
 @dataclass(frozen=True)

@@ -236,12 +236,8 @@ FILES: dict[str, Callable[[RigFrames], str]] = {
     "cameras.txt": colmap_cameras_txt,
 }
 #: These functions give the texts with poses for people to copy, by the text's name.
-COPIED: dict[str, Callable[[RigFrames], str]] = {
-    "static_tf.launch.py": static_tf_launch,
-    "rig.urdf.xacro": urdf_xacro,
-    "tf.yaml": tf_yaml,
-    "poses.py": python_poses,
-}
+COPIED = {name: FILES[name] for name in ("static_tf.launch.py", "rig.urdf.xacro", "tf.yaml")}
+COPIED["poses.py"] = python_poses
 #: These functions give the texts of a folder's files, by the files' names: one for each camera.
 FOLDERS: dict[str, Callable[[RigFrames], dict[str, str]]] = {"camera_info": camera_info_yaml}
 #: Files in these folders have this ending.

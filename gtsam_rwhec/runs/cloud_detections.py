@@ -113,7 +113,8 @@ def detect_in_clouds(
             drawn.setdefault(stamp, record_of_cloud(_thinned(cloud), clouds_topic(sensor), stamp, frame))
         else:
             faults.append(str(cloud))
-            warnings.warn(f"{cloud}. It counts as a cloud that cannot be used", LogWarning, stacklevel=3)
+            if camera is not None or not source.names:  # else it was said when the log was made of a folder
+                warnings.warn(f"{cloud}. It counts as a cloud that cannot be used", LogWarning, stacklevel=3)
     stamps = np.array(list(drawn), dtype=np.int64)
     check_order(stamps, f"topic {topic}")
     if not drawn:

@@ -91,6 +91,7 @@ def test_a_size_that_the_motion_hardly_tells_asks_for_care_with_what_it_moves() 
     found = rw.calibrate(problem)
     assert found.judgement.grounds == (rw.Ground.SIZE_UNTOLD,)
     assert "% only, and 0.2 %, as printers err, moves" in found.verdict_reason
+    assert "(of clouds: a known length with the sensor)" in found.verdict_reason
     assert rw.calibrate(problem, rw.CalibrateOptions(sizes="known")).verdict is rw.Verdict.USE
 
 

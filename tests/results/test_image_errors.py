@@ -190,7 +190,7 @@ def test_without_stamps_the_order_counts() -> None:
     assert tag.removed_at == {"far": ((PIECES // 4, 1),)}
     assert board.used_at == ((0, 1), (PIECES // 2, 1))
     (only,) = removed_list(pairs, lambda sensor, stamp: "no")
-    assert (only.image, only.time_s, only.reason) == ("measurement 1", None, "far")
+    assert (only.image, only.time_s, only.reason) == ("measurement 2", None, "far")
 
 
 def test_many_pairs_are_one_row_a_sensor() -> None:

@@ -220,6 +220,7 @@ def test_bad_clouds_are_named_and_the_others_used(folder: Path, made: SimulatedC
     assert "view4.npy is empty" in said
     assert "view6.npy: of 100 points none is seen" in said
     assert "view9.npy: of 1000000 points none is seen" in said
+    assert said.count("It counts as a cloud that cannot be used") == 3  # each once
     degrees, mm = off(sensor(tmp_path / "out"), made.T_sensorcarrier_sensor)
     assert degrees < 0.1
     assert mm < 0.6
@@ -245,21 +246,14 @@ def test_depth_images_that_show_nothing_are_named_by_topic_and_stamp() -> None:
         cloud_of_depth(dark, other, source="depth/3.png")  # an image of a folder has a name
 
 
-@pytest.mark.parametrize(
-    ("change", "words"),
-    [
-        pytest.param("clouds in millimetres", r"millimetres", marks=pytest.mark.slow),
-        ("empty", r"none of the 8 clouds of camera can be used; the first: .*view3\.npy"),
-    ],
-)
-def test_what_is_wrong_with_all_is_named(folder: Path, tmp_path: Path, change: str, words: str) -> None:
-    """What else is wrong with poses is named by `seen_object`, and tested there."""
+def test_what_is_wrong_with_all_is_named(folder: Path, tmp_path: Path) -> None:
+    """What else is wrong with poses and units is named by `seen_object`, and tested there."""
     bad = tmp_path / "bad"
     shutil.copytree(folder, bad)
     for path in (bad / "clouds").iterdir():
-        np.save(path, np.load(path) * (1000.0 if "mill" in change else 0.0))
-    said = run("calibrate", bad, "--rig", bad / "rig.yaml", "-o", tmp_path / "out", status=(1, 2))
-    assert re.search(words, said), said
+        np.save(path, np.zeros((9, 3)))
+    said = run("calibrate", bad, "--rig", bad / "rig.yaml", "-o", tmp_path / "out", status=2)
+    assert re.search(r"none of the 8 clouds of camera can be used; the first: .*view3\.npy", said), said
 
 
 def real_clouds(shared_data: Path, name: str) -> Path:
@@ -318,6 +312,22 @@ def test_a_folder_of_depth_images_is_a_folder_of_clouds(made: SimulatedClouds, t
     degrees, mm = off(found.registered.T_sensorcarrier_sensor, made.T_sensorcarrier_sensor)
     assert degrees < 1.0  # pixels are 3 mm wide
     assert mm < 5.0
+    for file in map(str, (tmp_path / "depth").iterdir()):  # in tenths of a millimetre
+        cv2.imwrite(file, 10 * cv2.imread(file, cv2.IMREAD_UNCHANGED))
+    found = propose_cloud_rig(tmp_path, cloud_folders(tmp_path), silent)
+    assert "images are 10 times those of the poses, like 0.1 mm beside mm: multiply unit_m by 0.1" in found.notes[-1]
+
+
+def test_poses_of_other_clouds_are_named_before_how_they_are_read(
+    folder: Path, made: SimulatedClouds, tmp_path: Path
+) -> None:
+    """Of poses that were shifted by a row, the first words were of angles."""
+    shutil.copytree(folder / "clouds", tmp_path / "clouds")
+    T = se3.inverse(np.r_[made.A[1:], made.A[:1] @ made.A[2]])  # the last is of no cloud
+    rows = np.column_stack([T[:, :3, 3], Rotation.from_matrix(T[:, :3, :3]).as_quat()])
+    np.savetxt(tmp_path / "poses.csv", rows, delimiter=",", header="x,y,z,qx,qy,qz,qw", comments="")
+    found = propose_cloud_rig(tmp_path, cloud_folders(tmp_path), silent)
+    assert found.notes[-1].startswith("the poses belong to other clouds: each cloud fits the pose one row before its")
 
 
 @pytest.mark.slow
