@@ -213,10 +213,10 @@ def _check_different(surfaces: Sequence[Surface], A: Array) -> None:
         )
 
 
-def registered_in_turn(views: Views, Y: Array) -> tuple[Registrations, Array]:
+def registered_in_turn(views: Views, Y: Array) -> tuple[Registrations, Array, bool]:
     """Registrations of pairs and the certified pose of the sensor on its carrier, in turn until both are still.
 
-    ``Y`` (4, 4) is the pose from which they start.
+    ``Y`` (4, 4) is the pose from which they start. The last result is whether the pose is certified.
     """
     spacing = views.spacing.faces_m
     i, j = overlapping_pairs(views.surfaces, se3.inverse(views.A) @ Y, GATE * spacing)
@@ -232,11 +232,11 @@ def registered_in_turn(views: Views, Y: Array) -> tuple[Registrations, Array]:
             raise CloudError(_no_overlap(views, i, j))
         i, j, starts = pairs.i, pairs.j, pairs.B
         before = Y
-        Y, _ = certified_pose(pairs)
+        Y, is_certified = certified_pose(pairs)
         moved = _at_middle(views, se3.inverse(views.A) @ (Y - before), np.arange(len(views.at)))
         if np.ptp(moved, axis=0).max() < STILL * spacing:
             break
-    return pairs, Y
+    return pairs, Y, is_certified
 
 
 def check_agreement(views: Views, pairs: Registrations, Y: Array) -> None:
