@@ -36,7 +36,7 @@ from gtsam_rwhec.geometry.real_numbers import check_kind
 from gtsam_rwhec.problem.measurements import Pair
 from gtsam_rwhec.problem.problem import Problem
 from gtsam_rwhec.problem.selection import selected
-from gtsam_rwhec.solver.solution import Solution
+from gtsam_rwhec.solver.solution import Solution, solve
 from gtsam_rwhec.solver.solve_options import SolveOptions
 
 RobustChoice = Literal["auto", "gnc", "none"]
@@ -213,6 +213,17 @@ class Run:
     #: The certified solution of the measurements that agree, and which these are, if the stage of clocks and sizes
     #: found them
     agreed: tuple[Solution, Inliers] | None = None
+    #: The last two problems that were solved, with their solutions: several stages ask for the same
+    solved: list[tuple[Problem, Solution]] = field(default_factory=list, repr=False)
+
+    def solution_of(self, problem: Problem) -> Solution:
+        """The certified solution of a problem."""
+        for known, solution in self.solved:
+            if known is problem:
+                return solution
+        solution = solve(problem, options=self.options.solve, progress=self.tell)
+        self.solved[:] = [(problem, solution), *self.solved[:1]]
+        return solution
 
     @property
     def says_so(self) -> str:

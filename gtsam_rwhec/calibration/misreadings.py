@@ -57,7 +57,7 @@ from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.problem.knowledge import ScaleMode
 from gtsam_rwhec.problem.measurements import Pair
 from gtsam_rwhec.problem.problem import Problem
-from gtsam_rwhec.solver.solution import Solution, solve
+from gtsam_rwhec.solver.solution import Solution
 
 
 @dataclass(frozen=True)
@@ -205,7 +205,7 @@ def misread_as_recorded(run: Run) -> Reading:
 
 def _of_recording(problem: Problem, run: Run) -> tuple[Misreading, ...]:
     assert run.recording is not None
-    found = misreadings(problem, solve(problem, options=run.options.solve, progress=run.tell), progress=run.tell)
+    found = misreadings(problem, run.solution_of(problem), progress=run.tell)
     return (tuple(one for one in found if not one.of_B) or found) if run.recording.is_detected else found
 
 

@@ -121,7 +121,7 @@ def _agreed(run: Run, inliers: Inliers) -> tuple[Solution, Inliers] | None:
     """The measurements that agree and their certified solution; None where they are to be looked for again."""
     if run.options.robust == "none" or run.options.noise == "given" or not inliers:
         return None
-    return solve(agreeing(run.problem, inliers), options=run.options.solve, progress=run.tell), inliers
+    return run.solution_of(agreeing(run.problem, inliers)), inliers
 
 
 def _told(run: Run, problem: Problem, moved_s: Mapping[str, float]) -> _Settled | None:
@@ -154,7 +154,7 @@ def _told(run: Run, problem: Problem, moved_s: Mapping[str, float]) -> _Settled 
 def _first(run: Run, problem: Problem) -> Solution | None:
     """The certified solution of all measurements; None where it has no positive scale, and outliers are looked for."""
     try:
-        return solve(problem, options=run.options.solve, progress=run.tell)
+        return run.solution_of(problem)
     except ScaleError:
         if run.options.robust == "none":
             raise

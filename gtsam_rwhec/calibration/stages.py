@@ -38,7 +38,7 @@ from gtsam_rwhec.calibration.stated_knowledge import (
     doubt_stated_sizes,
     say_estimated_sizes,
 )
-from gtsam_rwhec.calibration.trial_fits import implausible
+from gtsam_rwhec.calibration.trial_fits import implausible, remembered_fits
 from gtsam_rwhec.calibration.verdict import READING, Finding, Ground, Judgement, findings_of, proof_of
 from gtsam_rwhec.errors import OptionError, RwhecError, ScaleError
 from gtsam_rwhec.files.progress import Progress, check_progress, silent
@@ -49,7 +49,7 @@ from gtsam_rwhec.problem.measurements import Pair
 from gtsam_rwhec.problem.problem import Problem
 from gtsam_rwhec.problem.selection import aligned_at, without_copies
 from gtsam_rwhec.solver.free_directions import FreeDirection, FreeReason, all_slide
-from gtsam_rwhec.solver.solution import Solution, solve
+from gtsam_rwhec.solver.solution import Solution
 
 #: Standard deviations about the axis with the second most turning: below this the carriers turned too little.
 LITTLE_RAD = float(np.radians(2.0))
@@ -134,6 +134,7 @@ FEWEST_POSES = 6
 
 
 @one_blas_thread()
+@remembered_fits()
 def calibrate(
     problem: Problem,
     options: CalibrateOptions | None = None,
@@ -345,7 +346,7 @@ def _doubt_untested_corners(run: Run, found: Answer) -> None:
 def _solved(run: Run) -> tuple[Solution | None, str]:
     """The certified solution of all measurements; without one, why there is none."""
     try:
-        return solve(run.problem, options=run.options.solve, progress=run.tell), ""
+        return run.solution_of(run.problem), ""
     except ScaleError as error:
         return None, str(error)
 

@@ -7,13 +7,14 @@ tell at once (points to planes), from a wide gate to a narrow one, and few are k
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from rwhec_factors import se3
 from scipy.spatial.transform import Rotation
 
+from gtsam_rwhec.clouds.point_to_plane import across
 from gtsam_rwhec.clouds.surfaces import Features, Surface, size_of
 from gtsam_rwhec.geometry.poses import Array
 
@@ -115,36 +116,46 @@ class _Search:
         misfit = ((rows @ solved - right.T) ** 2).sum(axis=0)
         return se3.pose(R, solved[:3].T)[np.argsort(misfit)[: ROTATIONS // 2]]
 
-    def look(self, Y: Array, gate: float, *, fine: bool) -> tuple[Array, Array, Array, Array]:
-        """Misfits and near shares (H, P) of poses (H, 4, 4), gradients (H, 6) and normal matrices (H, 6, 6)."""
-        misfits, near = [], []
-        gradient, normal = np.zeros((len(Y), 6)), np.zeros((len(Y), 6, 6))
+    def near(self, Y: Array, gate: float, *, fine: bool) -> Iterator[tuple[Array, Array, Features, Array, np.ndarray]]:
+        """By pair at poses (H, 4, 4): T_other_one, points moved by it (3, H, m), the other's surface, and distances and
+        places (H, m) of what is nearest there."""
         inverse = se3.inverse(Y)
         for points, other, motion in zip(self.pairs.points, self.pairs.others, self.pairs.motions, strict=True):
             T = inverse @ motion @ Y
-            R = T[:, :3, :3]
-            moved = points @ R.transpose(0, 2, 1) + T[:, None, :3, 3]
+            turned = T[:, :3, :3].transpose(1, 0, 2).reshape(-1, 3) @ points.T
+            moved = turned.reshape(3, len(Y), -1) + T[:, :3, 3].T[:, :, None]
             faces = self.fine[other] if fine else self.coarse[other]
-            distances, at = (each.reshape(moved.shape[:2]) for each in faces.nearest(moved.reshape(-1, 3), gate))
-            misfits.append((np.minimum(distances / gate, 1.0) ** 2).mean(axis=1))
-            near.append(np.isfinite(distances).mean(axis=1))
+            distances, at = (each.reshape(len(Y), -1) for each in faces.nearest(moved.reshape(3, -1).T, gate))
+            yield T, moved, faces, distances, at
+
+    def look(self, Y: Array, gate: float, *, fine: bool) -> tuple[Array, Array]:
+        """Misfits and near shares (H, P) of poses (H, 4, 4)."""
+        distances = [each[3] for each in self.near(Y, gate, fine=fine)]
+        misfits = [(np.minimum(each / gate, 1.0) ** 2).mean(axis=1) for each in distances]
+        return np.array(misfits).T, np.array([np.isfinite(each).mean(axis=1) for each in distances]).T
+
+    def told(self, Y: Array, gate: float, *, fine: bool) -> tuple[Array, Array]:
+        """Gradients (H, 6) and normal matrices (H, 6, 6) of poses (H, 4, 4)."""
+        gradient, normal = np.zeros((len(Y), 6)), np.zeros((len(Y), 6, 6))
+        for T, moved, faces, distances, at in self.near(Y, gate, fine=fine):
             weights = np.maximum(1.0 - (distances / gate) ** 2, 0.0) ** 2
-            normals = faces.normals[at]
-            residuals = np.einsum("hni,hni->hn", normals, moved - faces.points[at])
-            local = normals @ R
-            # d T = T (x - Ad(T^-1) x) for Y exp(x)
-            by_Y = np.eye(6) - se3.adjoint(se3.inverse(T))
-            rows = np.concatenate([np.cross(points, local), local], axis=2) @ by_Y
-            weighted = weights[:, :, None] * rows
-            gradient += np.einsum("hni,hn->hi", weighted, residuals)
-            normal += weighted.transpose(0, 2, 1) @ rows
-        return np.array(misfits).T, np.array(near).T, gradient, normal
+            normals = faces.normals.T.take(at, axis=1)
+            residuals = (normals * (moved - faces.points.T.take(at, axis=1))).sum(axis=0)
+            rows = across(moved, normals)
+            with_residuals = np.concatenate([rows, residuals[None]]).transpose(1, 2, 0)
+            sums = (weights * rows).transpose(1, 0, 2) @ with_residuals
+            # d T = exp(Ad(T) x - x) T for Y exp(x)
+            by_Y = se3.adjoint(T) - np.eye(6)
+            to_Y = by_Y.transpose(0, 2, 1)
+            gradient += (to_Y @ sums[:, :, 6:])[:, :, 0]
+            normal += to_Y @ sums[:, :, :6] @ by_Y
+        return gradient, normal
 
     def refined(self, Y: Array, gate: float, steps: int, *, fine: bool) -> tuple[Array, Array]:
         """Poses after some damped steps, and their misfits."""
         units = np.r_[np.ones(3), np.full(3, self.size)]
         for _ in range(steps):
-            _, _, gradient, normal = self.look(Y, gate, fine=fine)
+            gradient, normal = self.told(Y, gate, fine=fine)
             normal = normal * units[:, None] * units
             damping = 1e-3 * np.trace(normal, axis1=1, axis2=2)[:, None, None] / 6.0 + 1e-12
             x = -np.linalg.solve(normal + damping * np.eye(6), (gradient * units)[..., None])[..., 0] * units
@@ -194,7 +205,7 @@ def first_poses(surfaces: Sequence[Surface], A: Array, spacing_m: float, start: 
         Y, misfits = search.apart(Y, misfits, most)
     gate = LAST[0] * spacing_m
     Y, _ = search.apart(*search.refined(Y, gate, LAST[1], fine=True), len(Y))
-    misfits, near, _, _ = search.look(Y, gate, fine=True)
+    misfits, near = search.look(Y, gate, fine=True)
     best, *others = (Start(*each) for each in zip(Y, misfits, near, strict=True))
     return [best, *(each for each in others if _is_another(search, best, each, gate))]
 

@@ -171,7 +171,7 @@ def seen_object(clouds: Iterable[Cloud], A: PosesLike, options: ObjectOptions | 
 
 def seen_from(views: Views, A: Array, Y: Array) -> SeenObject:
     """As `seen_object`, of `prepared` views, from a pose (4, 4) that explains them."""
-    registrations, Y = registered_in_turn(views, Y)
+    registrations, Y, is_certified = registered_in_turn(views, Y)
     together = largest_group(len(views.at), registrations.i, registrations.j)
     out = [*views.left_out, *(_apart(views, int(k)) for k in np.flatnonzero(~together))]
     kept, place = views.selected(together), np.cumsum(together) - 1
@@ -182,7 +182,8 @@ def seen_from(views: Views, A: Array, Y: Array) -> SeenObject:
     spacing_m, noise_m = views.spacing.faces_m, views.spacing.left_m
     joint = joint_poses(kept.surfaces, se3.inverse(kept.A) @ Y, of_A, inside, GATE * spacing_m, noise_m)
     origin = se3.pose(np.eye(3), _centre(kept.surfaces, joint.T_common_sensor))
-    stays, Y, is_certified = _where_it_was(kept, joint, inside, Y, origin)
+    of_all = (Y, is_certified) if together.all() else certified_pose(inside)
+    stays, Y, is_certified = _where_it_was(kept, joint, inside, of_all, origin)
     check_agreement(kept, inside, Y)
     out += [_moved(kept, k, far) for k, far in stays.items()]
     turn = _about(origin, joint)[1]
@@ -230,27 +231,25 @@ def motions(clouds: Iterable[Cloud], A: PosesLike, options: ObjectOptions | None
     """
     options = options or ObjectOptions()
     views = prepared(clouds, A, options)
-    registrations, Y = registered_in_turn(views, first_pose(views, options))
+    registrations, Y, _ = registered_in_turn(views, first_pose(views, options))
     check_agreement(views, registrations, Y)
     return registrations.renamed(views.at)
 
 
 def _where_it_was(
-    views: Views, joint: JointPoses, pairs: Registrations, Y: Array, origin: Array
+    views: Views, joint: JointPoses, pairs: Registrations, of_all: tuple[Array, bool], origin: Array
 ) -> tuple[dict[int, float], Array, bool]:
     """Views in which the thing was elsewhere, with the distance (m); the certified pose of the sensor by the others.
 
-    A CloudError says from which view on the thing was elsewhere, or that too many views contradict each other.
+    ``of_all`` is that by all pairs. A CloudError says from which view on the thing was elsewhere, or that too many
+    views contradict each other.
     """
     to_middle = se3.inverse(origin)
     unit = np.array([units(each.faces.points)[0] for each in views.surfaces])
     size = size_of(views.surfaces)
     moved: dict[int, float] = {}
+    at, (Y, is_certified) = np.arange(len(views.at)), of_all
     for _ in views.at:
-        still = ~np.isin(np.arange(len(views.at)), list(moved))
-        chosen = pairs.selected(still[pairs.i] & still[pairs.j])
-        Y, is_certified = certified_pose(chosen)
-        at = np.flatnonzero(still)
         predicted = se3.inverse(views.A[at]) @ Y
         move = move_of(
             to_middle @ joint.T_common_sensor[at], to_middle @ predicted, joint.covariances[at], unit[at], size
@@ -269,6 +268,8 @@ def _where_it_was(
                 "views contradict each other in where the thing was: "
                 + "; ".join(str(_moved(views, k, far)) for k, far in moved.items())
             )
+        at = np.setdiff1d(at, list(moved))
+        Y, is_certified = certified_pose(pairs.selected(np.isin(pairs.i, at) & np.isin(pairs.j, at)))
     return moved, Y, is_certified
 
 

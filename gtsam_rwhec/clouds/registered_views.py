@@ -226,10 +226,10 @@ def _left_out(surfaces: Sequence[Surface], marks: Array, A: Array) -> list[ViewF
     return found
 
 
-def registered_in_turn(views: Views, Y: Array) -> tuple[Registrations, Array]:
+def registered_in_turn(views: Views, Y: Array) -> tuple[Registrations, Array, bool]:
     """Registrations of pairs and the certified pose of the sensor on its carrier, in turn until both are still.
 
-    ``Y`` (4, 4) is the pose from which they start.
+    ``Y`` (4, 4) is the pose from which they start. The last result is whether the pose is certified.
     """
     spacing = views.spacing.faces_m
     i, j = overlapping_pairs(views.surfaces, se3.inverse(views.A) @ Y, GATE * spacing)
@@ -245,11 +245,11 @@ def registered_in_turn(views: Views, Y: Array) -> tuple[Registrations, Array]:
             raise CloudError(_unexplained(views, first_poses(views.surfaces, views.A, spacing, Y)[0].misfit))
         i, j, starts = pairs.i, pairs.j, pairs.B
         before = Y
-        Y, _ = certified_pose(pairs)
+        Y, is_certified = certified_pose(pairs)
         moved = _at_middle(views, se3.inverse(views.A) @ (Y - before), np.arange(len(views.at)))
         if np.ptp(moved, axis=0).max() < STILL * spacing:
             break
-    return pairs, Y
+    return pairs, Y, is_certified
 
 
 def check_agreement(views: Views, pairs: Registrations, Y: Array) -> None:

@@ -179,13 +179,14 @@ class CleanedLog:
             ),
         )
 
-    def recording(self, pairs: Pairs) -> Recording:
-        """What the log has besides its measurements."""
+    def recording(self, pairs: Pairs, problem: Problem) -> Recording:
+        """What the log has besides its measurements, of which ``problem`` has the used ones."""
         rig, offsets_s = self.rig, self.cleaning.time_offsets_s
         used = {pair.sensor for pair, measured in pairs.items() if measured.used.any()}
         stated = {name: offsets_s.get(name, 0.0) for name in rig.sensors if name in used and name not in self.estimated}
+        is_marked = any(why in OF_THE_MOTION for measured in pairs.values() for why in measured.reasons)
         return Recording(
-            uncleaned=self.problem_of(without_marks(pairs, OF_THE_MOTION)),
+            uncleaned=self.problem_of(without_marks(pairs, OF_THE_MOTION)) if is_marked else problem,
             is_detected=self.is_detected,
             is_inverse=rig.carriers.poses.parent_and_child[0] == rig.carriers.targets,
             late=tuple(late_clocks(pairs, self.motion.trajectory, rig, stated)),
@@ -221,7 +222,7 @@ def solve_log(log: Log | str | Path, rig: Rig | None = None, *, progress: Progre
 def _solved(log: CleanedLog, progress: Progress | None) -> Calibrated:
     rig, offsets_s = log.rig, log.cleaning.time_offsets_s
     pairs, against = with_comparable_noise(log.pairs, rig, log.motion, offsets_s, progress or silent)
-    problem = log.problem_of(pairs)
+    problem = of_poses = log.problem_of(pairs)
     for one in log.metadata.detection.objects:
         pair = Pair(one.target, one.sensor)
         if pair in pairs:
@@ -234,7 +235,7 @@ def _solved(log: CleanedLog, progress: Progress | None) -> Calibrated:
         problem = log.corners.in_problem(problem, pairs, log.cameras)
     except CameraError as error:  # a driver's corners outside of its images: the poses have an answer, in doubt
         against.append(Finding(Ground.CORNERS_DOUBTED, str(error)))
-    found = calibrate(problem, log.options(), recording=log.recording(pairs), progress=progress)
+    found = calibrate(problem, log.options(), recording=log.recording(pairs, of_poses), progress=progress)
     refined = found.refined or _for_pictures(found, log.options(), progress)
     whole = {name: offsets_s.get(name, 0.0) + more for name, more in refined.time_offsets_s.items()}
     pairs = _with_outliers_marked(at_offsets(pairs, log.motion.trajectory, offsets_s | whole, whole), found.outliers)

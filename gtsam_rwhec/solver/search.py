@@ -8,7 +8,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from rwhec_factors.se3 import so3_nearest
+from rwhec_factors.se3 import pose, so3_nearest
 
 from gtsam_rwhec.files.progress import Progress
 from gtsam_rwhec.geometry.poses import Array
@@ -451,6 +451,12 @@ class Searched:
     order: Elimination
     stages: Stages
     search: Search | None
+
+    @property
+    def poses(self) -> dict[str, Array]:
+        """The free frames' poses (4, 4) about the user's origin."""
+        answer, shift = self.found.answer, self.part.frame_shift
+        return {n: pose(R, t + shift(n)) for n, R, t in zip(self.part.free, answer.R, answer.t, strict=True)}
 
     @property
     def has_twin(self) -> bool:

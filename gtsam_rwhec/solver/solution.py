@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import warnings
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
+from functools import partial
 
 import gtsam
 import numpy as np
-from rwhec_factors.se3 import pose
 from scipy.special import chdtr, chdtrc
 
 from gtsam_rwhec.errors import NotCertifiedWarning, NotUniqueWarning, OptionError, ScaleError, WeightsWarning
@@ -126,24 +127,18 @@ class PartSolution:
 
     part: Part
     answer: Answer
+    poses: dict[str, Array]
     certificate: Certificate
     identifiability: Identifiability
     residuals: dict[Pair, Residual]
     residual_cost: float
 
-    @property
-    def poses(self) -> dict[str, Array]:
-        """The free frames' poses (4, 4) about the user's origin."""
-        answer, shift = self.answer, self.part.frame_shift
-        return {n: pose(R, t + shift(n)) for n, R, t in zip(self.part.free, answer.R, answer.t, strict=True)}
-
     @staticmethod
     def of(searched: Searched) -> PartSolution:
-        """Complete what a search found; a ``ScaleError`` for a scale that is not positive."""
+        """Complete what a search found."""
         part, found = searched.part, searched.found
         with searched.stages.of("identifiability"):
             answer = found.answer
-            _check_scale(part, answer, found.is_closed)
             poses = PairPoses.of(part, answer)
             J_t, J_R = costs_of_pairs(part, poses)
             known = identify(part, poses, J_t, J_R, searched.order)
@@ -173,7 +168,8 @@ class PartSolution:
             figures=found.figures,
         )
         residuals = residuals_of_pairs(part, poses, J_t, J_R)
-        return PartSolution(part, answer, certificate, known, residuals, float(J_t.sum() + J_R.sum()))
+        cost = float(J_t.sum() + J_R.sum())
+        return PartSolution(part, answer, searched.poses, certificate, known, residuals, cost)
 
 
 def _check_scale(part: Part, answer: Answer, proven: bool) -> None:
@@ -251,16 +247,19 @@ def solve(
             if initial is None or about is None or problem.scale != "shared"
             else checked_scale(initial[2], "the start's scale")
         )
-        results = [_solved(part, method, initial, options, progress) for part in parts_of(problem, about, scale)]
-        cost = np.inf
-        # Directions of translations are those of an answer: they are taken there again until the answer stays.
-        for _ in range(MOST_ROUNDS if problem.directed else 0):
-            before, cost = cost, sum(result.certificate.cost for result in results)
-            if abs(cost - before) <= STILL * max(cost, 1.0):
-                break
-            about = {name: T for result in results for name, T in result.poses.items()}
-            scale = results[0].answer.scale
-            results = [_solved(part, method, initial, options, progress) for part in parts_of(problem, about, scale)]
+        searched = partial(_searched, method=method, initial=initial, options=options, progress=progress)
+        found: Iterable[Searched] = map(searched, parts_of(problem, about, scale))
+        if problem.directed:
+            rounds, cost = list(found), np.inf
+            # Directions of translations are those of an answer: they are taken there again until the answer stays.
+            for _ in range(MOST_ROUNDS):
+                before, cost = cost, sum(each.found.cost for each in rounds)
+                if abs(cost - before) <= STILL * max(cost, 1.0):
+                    break
+                about = {name: T for each in rounds for name, T in each.poses.items()}
+                rounds = [searched(part) for part in parts_of(problem, about, rounds[0].found.answer.scale)]
+            found = rounds
+        results = [PartSolution.of(each) for each in found]
     return _merge(problem, results)
 
 
@@ -271,13 +270,14 @@ MOST_ROUNDS = 20
 STILL = 1e-8
 
 
-def _solved(
+def _searched(
     part: Part,
     method: Method,
     initial: tuple[Poses, Poses, Scale] | None,
     options: SolveOptions,
     progress: Progress | None,
-) -> PartSolution:
+) -> Searched:
+    """What a search found, but for its forms, which large parts need no more; a ``ScaleError`` for a scale below 0."""
     search = Search.of(part, options, progress)
     if options.nonnegative_scale:
         found = run_with_nonnegative_scale(search)
@@ -285,9 +285,8 @@ def _solved(
         found = search.run(method, rotations_as_variables(part, given_answer(part, *initial).R))
     else:
         found = search.with_positive_scale(search.run(method, None))
-    searched = search.ended(found)
-    del search  # and its forms, which large parts need no more
-    return PartSolution.of(searched)
+    _check_scale(part, found.answer, found.is_closed)
+    return search.ended(found)
 
 
 @one_blas_thread()
@@ -343,6 +342,7 @@ def certify(
         if not np.isfinite(cost):
             raise ScaleError("the cost of the answer overflows; are its translations in metres, and its scale right?")
         tolerance = search.tolerance(cost)
+        _check_scale(part, found.answer, found.is_closed)
         best = PartSolution.of(search.ended(found)).certificate
         gap = cost - found.bound.lower_bound
         cause, figures = best.cause, best.figures
