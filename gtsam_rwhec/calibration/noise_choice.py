@@ -267,23 +267,7 @@ def _say_sizes(run: Run, model: NoiseInData, shown: str) -> None:
 def _say_drift(run: Run, model: NoiseInData) -> None:
     """Record whether errors of neighbours in time are alike."""
     what, record = "drift", run.record
-    if model.is_drift_untried:
-        evidence = model.drift_not_sought or "more pairs are measured at the same instants than its model can hold"
-        record.choose(what, "seen, and not modelled; blocks of time widen the standard deviations", evidence)
-        widened = "the standard deviations were widened as blocks of time show, and may still be too small"
-        if model.drift_not_sought:
-            widened = "the log is too short for one, and the standard deviations may be too small"
-        record.find(Ground.CORRELATED, f"errors of neighbours in time are alike, and no model holds them; {widened}")
-    elif model.correlation is None:
-        if run.options.drift == "none":
-            record.choose(what, "none", run.says_so)
-        elif model.drift_not_sought:
-            # No finding: few instants hardly drift, and these have neighbours no more alike than chance makes them.
-            record.choose(what, "no model of it was tried", model.drift_not_sought)
-        else:
-            order = "" if model.has_stamps else " (rows are taken to be in order of time, since they have no stamps)"
-            record.choose(what, "none", f"errors of neighbours in time are no more alike than others{order}")
-    else:
+    if model.correlation is not None:
         kind = "a random walk" if model.correlation == 1.0 else f"errors correlated by {model.correlation:g} a step"
         clock = "" if model.has_stamps else "; a late clock looks like this too, and there are no stamps to tell"
         record.choose(
@@ -292,6 +276,28 @@ def _say_drift(run: Run, model: NoiseInData) -> None:
             f"a model in which neighbours in time share errors explains the residuals far better "
             f"({ratio_words(model.drift_evidence)}){clock}",
         )
+    elif model.is_drift_doubted:
+        many = "more pairs are measured at the same instants than its model can hold"
+        few = model.drift_not_sought or "no model of it explains the residuals far better"
+        evidence = few if model.is_short else many
+        record.choose(what, "seen, and not modelled; blocks of time widen the standard deviations", evidence)
+    elif run.options.drift == "none":
+        record.choose(what, "none", run.says_so)
+    elif model.drift_not_sought:
+        # No finding: few instants hardly drift, and these have neighbours no more alike than chance makes them.
+        record.choose(what, "no model of it was tried", model.drift_not_sought)
+    else:
+        order = "" if model.has_stamps else " (rows are taken to be in order of time, since they have no stamps)"
+        record.choose(what, "none", f"errors of neighbours in time are no more alike than others{order}")
+    is_asked = model.correlation is not None and run.options.drift != "auto"
+    if model.is_drift_doubted and not is_asked:
+        words = "no model holds them; blocks of time widened the standard deviations, which may still be too small"
+        if model.is_short:
+            words = (
+                f"{model.instants} instants are too few to tell how; the standard deviations may be too small "
+                "(a mount or a target that gave way does this, too)"
+            )
+        record.find(Ground.CORRELATED, f"errors of neighbours in time are alike, and {words}")
 
 
 def _say_lasting(run: Run, model: NoiseInData) -> None:
@@ -316,7 +322,7 @@ def _say_blocks(run: Run, model: NoiseInData) -> None:
         run.record.choose("blocks of the log", "agree as well as the noise allows", str(model.scatter[0]))
         return
     run.record.choose("blocks of the log", "do not agree; the standard deviations are larger for it", str(worst))
-    if worst.is_by_far and not model.is_drift_untried:  # which is said
+    if worst.is_by_far and not model.is_drift_doubted:  # which is said
         words = f"{worst}: errors are of another kind than any model of the noise that was tried, and last for long"
         moved = " (a mount or a target that gave way does this, too)" if worst.by == "time" else ""
         run.record.find(Ground.CORRELATED, f"{words}{moved}")

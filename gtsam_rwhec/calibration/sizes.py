@@ -279,7 +279,7 @@ def _under_all_noise(
         return []
     kinds = NoiseOptions()
     if like is not None:
-        if like.is_drift_untried:
+        if like.is_drift_doubted:
             return []
         walk = None if like.correlation is None or like.frame is None else Walk(like.correlation, like.frame)
         kinds = NoiseOptions(drift=walk or "none", side=like.hand, systematic=like.arms_assumed)
@@ -288,7 +288,7 @@ def _under_all_noise(
     except (CountError, ScaleError, np.linalg.LinAlgError, RuntimeError):
         return []  # harmless: the jackknife tests the sizes
     # where drift is untried, errors of neighbours in time are alike, and the deviations do not know it
-    return [] if noise.is_drift_untried else sizes_in(refined)
+    return [] if noise.is_drift_doubted else sizes_in(refined)
 
 
 def sizes_in(refined: Refined) -> list[TargetSize]:

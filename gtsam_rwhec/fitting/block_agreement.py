@@ -197,12 +197,12 @@ def scatter_about(
     return Scatter(frame, by, len(parts), ratio, freedom, chance, float(sizes[0]), float(sizes[1]))
 
 
-def too_much(scatter: Iterable[Scatter], *, is_drift_untried: bool = False) -> Scatter | None:
+def too_much(scatter: Iterable[Scatter], *, is_drift_doubted: bool = False) -> Scatter | None:
     """The scatter that is most beyond chance, of those that chance hardly makes; None where the model holds all.
 
     Where a drift is seen that no model holds, blocks of time tell alone how large it is: then the largest counts.
     """
-    if is_drift_untried:
+    if is_drift_doubted:
         of_time = (one for one in scatter if one.by == "time" and one.ratio > 1.0)
         return max(of_time, key=lambda one: one.ratio, default=None)
     return min((one for one in scatter if one.is_too_much), key=lambda one: one.chance, default=None)

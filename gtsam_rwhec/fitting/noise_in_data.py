@@ -23,6 +23,7 @@ from gtsam_rwhec.fitting.noise_search import (
     MOST_TRACKS,
     Settled,
     Task,
+    is_short,
     likeness_of_neighbours,
     moved,
     thinned,
@@ -85,10 +86,11 @@ class NoiseInData:
     systematic_evidence: float
     #: Why no drift was looked for; empty where it was, or an option says that there is none.
     drift_not_sought: str
+    is_short: bool  #: Whether tracks are too short to trust a model of drift
     #: Whether the order in time is known; without stamps it is that of rows.
     has_stamps: bool
-    #: Whether residuals are correlated in time, and there are too many tracks for a model of it, or too short ones.
-    is_drift_untried: bool
+    #: Whether residuals are correlated in time, and tracks are too many for a model of it, or too short to trust one.
+    is_drift_doubted: bool
     #: Whether the covariance has a constant error of A, which no residual shows, tied to the part that varies.
     arms_assumed: bool
     #: That such errors are there: the covariance averages over both.
@@ -296,8 +298,9 @@ def noise_in(
         drift_evidence=found.drift_evidence,
         systematic_evidence=found.systematic_evidence,
         drift_not_sought=why_no_drift(task),
+        is_short=is_short(task),
         has_stamps=task.instants.seconds is not None,
-        is_drift_untried=is_drift_untried(task, found),
+        is_drift_doubted=is_drift_doubted(task, found),
         arms_assumed=C.SYSTEMATIC_ROTATION in active,
         systematic_probability=_probability(task, found),
         constant_deviations=tuple(tuple(np.sqrt(variances).tolist()) for variances in constant),
@@ -325,11 +328,16 @@ def mixed(task: Task, found: Settled, larger: float = 1.0) -> tuple[JointCovaria
     return replace(task.layout, finite=finite), mixture, constant
 
 
-def is_drift_untried(task: Task, found: Settled) -> bool:
-    """Whether errors of neighbours are alike, and tracks are too many for a model of that, or few and too short."""
+def is_drift_doubted(task: Task, found: Settled) -> bool:
+    """Whether errors of neighbours are alike, and tracks are too many for a model of that, or too short to trust one.
+
+    In a short track a mount that slipped looks like drift, too.
+    """
     is_few = task.instants.chains <= MOST_TRACKS
-    if is_few and not (task.options.drift != "none" and why_no_drift(task)):
+    if is_few and (task.options.drift == "none" or not is_short(task)):
         return False
+    if found.model.drift is not None:
+        return True
     eliminated = found.model.eliminated(found.fit.sizes.values(found.fit.logs))
     left = eliminated.left(eliminated.measured.of.columns)
     tracks = [left[task.instants.chain == chain] for chain in range(task.instants.chains)]

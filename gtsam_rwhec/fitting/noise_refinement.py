@@ -17,7 +17,7 @@ from gtsam_rwhec.fitting.fit_options import C, NoiseOptions, RefineOptions
 from gtsam_rwhec.fitting.joint_covariance import JointCovariance, free_space_of
 from gtsam_rwhec.fitting.lasting_errors import lasting_errors
 from gtsam_rwhec.fitting.noise_graph import refined_of
-from gtsam_rwhec.fitting.noise_in_data import NoiseInData, is_drift_untried, mixed, noise_in, settled
+from gtsam_rwhec.fitting.noise_in_data import NoiseInData, is_drift_doubted, mixed, noise_in, settled
 from gtsam_rwhec.fitting.noise_rows import Instants
 from gtsam_rwhec.fitting.noise_search import SETTLED, Settled, Task, moved
 from gtsam_rwhec.fitting.refined import Refined
@@ -63,7 +63,7 @@ class UnderNoise:
         task, found = self.task, self.settled
         task.tell("covariances: with the uncertainty of the noise itself")
         scatter = scatter_of_blocks(task, found)
-        worst = too_much(scatter, is_drift_untried=is_drift_untried(task, found))
+        worst = too_much(scatter, is_drift_doubted=is_drift_doubted(task, found))
         lasting = lasting_errors(task, found)
         larger = max(1.0 if one is None else one.ratio for one in (worst, lasting))
         joint, mixture, constant = mixed(task, found, larger)

@@ -264,8 +264,9 @@ def moved(state: State, variables: Variables, layout: JointCovariance, d: Array)
     return State(X, Y, scales, clocks[UnknownKind.TIME_OFFSET], clocks[UnknownKind.CLOCK_RATE])
 
 
-#: A track has at least this many instants for a drift.
-SHORTEST_TRACK = 20
+#: A track has at least this many instants for a drift, and with fewer than these it is short: a model of drift is tried
+#: even where neighbours hardly look alike, and is not trusted where they do.
+SHORTEST_TRACK, SHORT_TRACK = 8, 20
 #: Tracks that are seen at the same instants share a state of at most this many tracks.
 MOST_TRACKS = 9
 #: The frames of a track's own drift, and the correlations that are tried first.
@@ -275,8 +276,9 @@ FIRST_CORRELATIONS: dict[Drift, tuple[float, ...]] = {
 }  # fmt: skip
 #: These correlations are tried where the walk is not a random one.
 MORE_CORRELATIONS = (0.6, 0.97, 0.99)
-#: A drift is in the model when it lowers -2 log of the density by more than this.
-PAYS = 6.0
+#: A drift is in the model when it lowers -2 log of the density by more than this, or by that where neighbours do not
+#: look alike (short tracks).
+PAYS, PAYS_UNSEEN = 6.0, 10.0
 #: A kind's first fit ends where -2 log of the density would fall by less than this; kinds up to so far above the best
 #: are fitted to the end.
 ROUGH, NEAR = 1.0, 10.0
@@ -317,11 +319,12 @@ def with_drift(task: Task, steady: Settled, tell: Progress) -> Settled:
     if kind.correlation < 1.0:
         more = best_of([Walk(each, kind.frame) for each in MORE_CORRELATIONS], walk)
         kind, walk = min((kind, walk), more, key=_height)
-    if options.drift == "auto" and walk.objective > steady.fit.objective - PAYS:
+    enough = steady.fit.objective - (PAYS if is_correlated(steady) else PAYS_UNSEEN)
+    if options.drift == "auto" and walk.objective > enough:
         return steady
     found = task.settle(steady.state, steady.model.side, kind, systematic=systematic, near=walk)
     # what paid about the answer without drift may not pay about its own
-    pays = options.drift != "auto" or found.fit.objective <= steady.fit.objective - PAYS
+    pays = options.drift != "auto" or found.fit.objective <= enough
     return found if pays else steady
 
 
@@ -330,7 +333,8 @@ def kinds_of(task: Task, steady: Settled) -> list[Walk]:
     kind, chains = task.options.drift, task.instants.chains
     assert not isinstance(kind, Walk)
     is_asked = kind != "auto"
-    frames = [*OWN_FRAMES] if chains <= MOST_TRACKS and (is_asked or is_correlated(steady)) else []
+    is_likely = is_asked or is_short(task) or is_correlated(steady)
+    frames = [*OWN_FRAMES] if chains <= MOST_TRACKS and is_likely else []
     bodies = int(task.instants.bodies.max()) + 1
     shares = bodies < chains and bodies <= MOST_TRACKS
     frames += [steady.model.side] if shares and (is_asked or frames or is_A_correlated(steady)) else []
@@ -345,10 +349,14 @@ def drifting(model: NoiseModel, walk: Walk) -> NoiseModel:
 
 def why_no_drift(task: Task) -> str:
     """Why no drift can be looked for; empty where it can."""
-    instants = task.instants
-    if instants.count < SHORTEST_TRACK * len(task.data) / instants.chains:
+    if is_short(task, SHORTEST_TRACK):
         return f"it takes {SHORTEST_TRACK} instants of each pair, one after the other"
     return ""
+
+
+def is_short(task: Task, than: int = SHORT_TRACK) -> bool:
+    """Whether tracks have fewer instants than that."""
+    return task.instants.count < than * len(task.data) / task.instants.chains
 
 
 def _height(tried: tuple[Walk, Fitted]) -> float:

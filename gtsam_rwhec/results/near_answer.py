@@ -18,7 +18,7 @@ from gtsam_rwhec.fitting.block_agreement import scatter_of_blocks, too_much
 from gtsam_rwhec.fitting.component_posterior import FEWEST, mixture_of
 from gtsam_rwhec.fitting.fit_options import NoiseOptions, RefineOptions
 from gtsam_rwhec.fitting.joint_covariance import JointCovariance, free_space_of
-from gtsam_rwhec.fitting.noise_in_data import is_drift_untried, settled
+from gtsam_rwhec.fitting.noise_in_data import is_drift_doubted, settled
 from gtsam_rwhec.fitting.noise_refinement import SPARE_EQUATIONS, agreeing
 from gtsam_rwhec.fitting.noise_rows import Instants
 from gtsam_rwhec.fitting.noise_search import Settled, Task, moved, thinned
@@ -78,7 +78,7 @@ def near(
     mixture = mixture_of(thinned(found.model), found.fit, found.model)
     basis = found.model.basis
     state = moved(found.state, task.variables, task.layout, basis @ mixture.step)
-    worst = too_much(scatter_of_blocks(task, found), is_drift_untried=is_drift_untried(task, found))
+    worst = too_much(scatter_of_blocks(task, found), is_drift_doubted=is_drift_doubted(task, found))
     finite = basis @ mixture.covariance @ basis.T * (1.0 if worst is None else worst.ratio)
     frames = [
         rows

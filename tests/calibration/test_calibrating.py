@@ -146,16 +146,16 @@ def test_too_few_measurements_say_which_choice_was_not_made_and_why() -> None:
 
 
 def test_drift_that_cannot_be_looked_for_says_why() -> None:
-    """Rows of one pair are taken to be in order of time, and 15 are too few."""
+    """Rows of one pair are taken to be in order of time, and 7 are too few."""
     raw = rig(1, 1).problem.measurements("target0", "sensor0")
     said = []
-    for count in (15, 20):
+    for count in (7, 15):
         problem = rw.Problem()
         problem.add("target0", "sensor0", raw.A[:count], raw.B[:count])
         said.append(choice(rw.calibrate(problem), "drift"))
     assert (said[0].chosen, said[0].evidence) == (
         "no model of it was tried",
-        "it takes 20 instants of each pair, one after the other",
+        "it takes 8 instants of each pair, one after the other",
     )
     assert said[1].chosen == "none"
     assert "since they have no stamps" in said[1].evidence

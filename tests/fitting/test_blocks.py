@@ -73,7 +73,7 @@ def settled(problem: rw.Problem) -> tuple[Task, Settled]:
 def test_blocks_of_time_tell_how_large_a_drift_is_that_no_model_holds() -> None:
     white, slow = (scatter_of_blocks(*settled(problem_of(correlation))) for correlation in (0.0, 0.9))
     assert too_much(white) is None
-    worst = too_much(slow, is_drift_untried=True)
+    worst = too_much(slow, is_drift_doubted=True)
     assert worst is not None
     assert worst.by == "time"
     assert worst.ratio > 4.0
