@@ -89,7 +89,7 @@ def test_the_verdict_says_that_no_model_holds_the_drift(monkeypatch: pytest.Monk
     calibration = rw.calibrate(problem, options)
     assert calibration.verdict is rw.Verdict.CARE
     assert rw.Ground.CORRELATED in calibration.judgement.grounds
-    assert "widened as blocks of time show" in calibration.verdict_reason
+    assert "blocks of time widened the standard deviations" in calibration.verdict_reason
     monkeypatch.setattr("gtsam_rwhec.fitting.noise_refinement.too_much", lambda *_, **__: None)
     before = rw.calibrate(problem, options)
     for name in ("camera", "tag_0"):

@@ -141,8 +141,9 @@ def test_measurements_without_corners_beside_others_are_counted(workcell_log: Pa
 
     def calibrated(detections: Mapping[tuple[str, str, int], DetectionRecord]) -> rw.Calibration:
         corners = replace(log.corners, detections=detections)
-        problem = corners.in_problem(log.problem_of(log.pairs), log.pairs, log.cameras)
-        return rw.calibrate(problem, log.options(), recording=log.recording(log.pairs))
+        of_poses = log.problem_of(log.pairs)
+        problem = corners.in_problem(of_poses, log.pairs, log.cameras)
+        return rw.calibrate(problem, log.options(), recording=log.recording(log.pairs, of_poses))
 
     some = calibrated(rest)
     assert some.refined is not None
