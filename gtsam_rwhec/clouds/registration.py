@@ -7,6 +7,8 @@ from dataclasses import dataclass, fields, replace
 
 import numpy as np
 from rwhec_factors import se3
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
 
 from gtsam_rwhec.clouds.point_to_plane import known, matches, sigmas, told_of_stretch
 from gtsam_rwhec.clouds.surfaces import Surface
@@ -157,8 +159,6 @@ def registered(
 
 def largest_group(count: int, i: np.ndarray, j: np.ndarray) -> np.ndarray:
     """Which of the views (count,) belong to the largest group that pairs connect."""
-    labels = np.arange(count)
-    while (labels[i] != labels[j]).any():
-        np.minimum.at(labels, i, labels[j])
-        np.minimum.at(labels, j, labels[i])
+    graph = coo_matrix((np.ones(len(i)), (i, j)), shape=(count, count))
+    labels = connected_components(graph, directed=False)[1]
     return np.asarray(labels == np.bincount(labels).argmax())

@@ -13,6 +13,8 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
+from scipy.sparse import csr_array
+from scipy.sparse.csgraph import connected_components
 
 from gtsam_rwhec.detect.images import Gray
 from gtsam_rwhec.geometry.poses import Array
@@ -115,9 +117,7 @@ def _groups(places: Array) -> list[np.ndarray]:
     apart = np.linalg.norm(places[:, None] - places, axis=2)
     third = np.sort(apart, axis=1)[:, 3]
     linked = apart <= NEAR * np.minimum(third[:, None], third)
-    from scipy.sparse.csgraph import connected_components  # slow to import, and few images need it
-
-    count, group = connected_components(linked, directed=False)
+    count, group = connected_components(csr_array(linked), directed=False)
     return [np.flatnonzero(group == number) for number in range(count)]
 
 
