@@ -38,14 +38,15 @@ BUDGET = {
     # clouds by a wrong focal length 110, in another unit or given twice 50; errors of groups of views, ends of edges 80
     # errors that last 30; an arm's stated accuracy 80; poses logged late, copies, mounts that slipped 200; LiDARs 20
     # a late clock that is less than sure, scales that run away, drifts that do not pay, regions, short logs 55
-    # clouds a sixth faster (components first, solutions kept within a run) 60; drift in short tracks 20
-    "lines": 101_852,
-    "code": 63_648,
+    # clouds a sixth faster (components first, solutions kept within a run) 45; drift in short tracks 20
+    "lines": 101_835,
+    "code": 63_635,
     # capture has 25 files, and is a package of its own
     "files": 438,
     "packages": 20,
     "names that occur twice": 0,
-    "lines of tests and benchmarks": 73_510,
+    # a test of millimetres through the command, and each slipped mount with its own ground: 15
+    "lines of tests and benchmarks": 73_525,
 }
 NO_CODE = {tokenize.COMMENT, tokenize.NL, tokenize.NEWLINE, tokenize.INDENT, tokenize.DEDENT, tokenize.ENDMARKER}
 

@@ -38,7 +38,7 @@ from gtsam_rwhec.calibration.stated_knowledge import (
     doubt_stated_sizes,
     say_estimated_sizes,
 )
-from gtsam_rwhec.calibration.trial_fits import implausible, remembered_fits
+from gtsam_rwhec.calibration.trial_fits import implausible
 from gtsam_rwhec.calibration.verdict import READING, Finding, Ground, Judgement, findings_of, proof_of
 from gtsam_rwhec.errors import OptionError, RwhecError, ScaleError
 from gtsam_rwhec.files.progress import Progress, check_progress, silent
@@ -134,7 +134,6 @@ FEWEST_POSES = 6
 
 
 @one_blas_thread()
-@remembered_fits()
 def calibrate(
     problem: Problem,
     options: CalibrateOptions | None = None,

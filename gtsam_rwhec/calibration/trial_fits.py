@@ -10,9 +10,7 @@ from __future__ import annotations
 import math
 import warnings
 from collections import defaultdict
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
-from contextvars import ContextVar
+from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import StrEnum
 from functools import partial
@@ -95,37 +93,18 @@ def likelihood_of_a_wrong_one(signal: Spread) -> float:
     return -3.0 * math.log(S_R * S_t) - 0.5 * (DEGREES_OF_T + 6.0) * math.log1p(6.0 / DEGREES_OF_T)
 
 
-#: Fits by all that they depend on.
-_FITS: ContextVar[dict[tuple[object, ...], TrialFit | None]] = ContextVar("fits")
-
-
-@contextmanager
-def remembered_fits() -> Iterator[None]:
-    """Inside it nothing is fitted twice: stages try the same readings of a log, and of what cleaning left of it."""
-    token = _FITS.set({})
-    try:
-        yield
-    finally:
-        _FITS.reset(token)
-
-
 def fitted(
     problem: Problem, sample: Sample, scale: ScaleMode | None = None, *, rounds: int = ROUNDS
 ) -> TrialFit | None:
     """Fit a sample of a problem robustly; ``scale`` overrules the problem's. None where the sample has no answer."""
+    mode = scale or problem.scale
     if not sample:
         return None  # a shift of rows leaves nothing of pairs with one row each
-    mode, fits = scale or problem.scale, _FITS.get({})
-    poses = [(pair, A.tobytes(), B.tobytes()) for pair, (A, B) in sample.items()]
-    fixed = [(name, T.tobytes()) for name, T in problem.fixed.items()]
-    key = (mode, rounds, *poses, *fixed, *problem.fixed_scales.items())
-    if key not in fits:
-        try:
-            with warnings.catch_warnings(action="ignore"), np.errstate(all="ignore"):  # words of trials are for nobody
-                fits[key] = _fitted(problem, sample, mode, rounds)
-        except (RwhecError, np.linalg.LinAlgError):
-            fits[key] = None  # too few measurements for this scale, or no finite answer: this reading explains nothing
-    return fits[key]
+    try:
+        with warnings.catch_warnings(action="ignore"), np.errstate(all="ignore"):  # the words of trials are for nobody
+            return _fitted(problem, sample, mode, rounds)
+    except (RwhecError, np.linalg.LinAlgError):
+        return None  # too few measurements for this scale, or no finite answer: this reading explains nothing
 
 
 def _fitted(problem: Problem, sample: Sample, mode: ScaleMode, rounds: int) -> TrialFit | None:

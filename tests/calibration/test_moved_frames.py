@@ -205,12 +205,19 @@ def slipped(at: int, seed: int, count: int = SLIPS) -> rw.Problem:
     return problem_of(A, inverse(Y) @ A @ X @ poses(chance, count, 1.2e-3, 4e-4))
 
 
-@pytest.mark.parametrize("seed", [1, 2, 3])
-def test_halves_of_few_measurements_disagree_too(seed: int) -> None:
+@pytest.mark.parametrize(
+    ("seed", "ground", "words"),
+    [
+        (1, rw.Ground.MOVED, "camera was at two poses from measurement 9 on"),
+        (2, rw.Ground.CORRELATED, "a mount or a target that gave way does this"),
+        (3, rw.Ground.CORRELATED, "a mount or a target that gave way does this"),
+    ],
+)
+def test_halves_of_few_measurements_disagree_too(seed: int, ground: rw.Ground, words: str) -> None:
     """The step was taken for noise: USE, as from 20 measurements on alone halves of them were compared."""
     judgement = rw.calibrate(slipped(8, seed, 16)).judgement
-    assert judgement.grounds in ((rw.Ground.CORRELATED,), (rw.Ground.MOVED,))
-    assert "a mount or a target that gave way does this" in judgement.reason or "was at two poses" in judgement.reason
+    assert judgement.grounds == (ground,)
+    assert words in judgement.reason
 
 
 def test_a_mount_that_slipped_is_alike_in_its_own_axes_and_not_in_those_of_the_target() -> None:
