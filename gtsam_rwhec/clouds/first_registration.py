@@ -116,7 +116,7 @@ class _Search:
         misfit = ((rows @ solved - right.T) ** 2).sum(axis=0)
         return se3.pose(R, solved[:3].T)[np.argsort(misfit)[: ROTATIONS // 2]]
 
-    def near(self, Y: Array, gate: float, *, fine: bool) -> Iterator[tuple[Array, Array, Features, Array, Array]]:
+    def near(self, Y: Array, gate: float, *, fine: bool) -> Iterator[tuple[Array, Array, Features, Array, np.ndarray]]:
         """By pair at poses (H, 4, 4): T_other_one, points moved by it (3, H, m), the other's surface, and distances and
         places (H, m) of what is nearest there."""
         inverse = se3.inverse(Y)

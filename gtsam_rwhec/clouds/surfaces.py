@@ -214,29 +214,24 @@ def _edges(points: Array, spacing_m: float, faces: Features) -> Features:
     of_all = fine.points()[:, :3].T
     near = np.ascontiguousarray(neighbours_in(small_gicp.KdTree(fine), of_all.T, AROUND + 1)[1].T[1:])
     # Around a point within a surface its neighbours' offsets sum to little.
-    lop = _lengths(of_all.take(near, axis=1).mean(axis=1) - of_all)
-    at = np.flatnonzero(lop > LOPSIDED * _lengths(of_all.take(near[-1], axis=1) - of_all))
+    lop = np.linalg.norm(of_all.take(near, axis=1).mean(axis=1) - of_all, axis=0)
+    at = np.flatnonzero(lop > LOPSIDED * np.linalg.norm(of_all.take(near[-1], axis=1) - of_all, axis=0))
     ends = of_all.take(at, axis=1)
     to = of_all.take(near.take(at, axis=1), axis=1) - ends[:, None]
     normals = faces.normals.T.take(faces.nearest(ends.T)[1], axis=1)
     first = np.cross(normals, np.eye(3).take(np.abs(normals).argmin(axis=0), axis=1), axis=0)
-    first /= np.maximum(_lengths(first), 1e-12)
+    first /= np.maximum(np.linalg.norm(first, axis=0), 1e-12)
     second = np.cross(normals, first, axis=0)
     x, y = (np.einsum("ikn,in->kn", to, axis) for axis in (first, second))
     angles = np.sort(np.arctan2(y, x), axis=0)
     gaps = np.diff(angles, axis=0, append=angles[:1] + 2.0 * np.pi)
-    facing = np.abs((normals * ends).sum(axis=0)) > FACING * _lengths(ends)
+    facing = np.abs((normals * ends).sum(axis=0)) > FACING * np.linalg.norm(ends, axis=0)
     on = (gaps.max(axis=0) > FREE_ANGLE) & facing
     outwards = (-x.mean(axis=0) * first - y.mean(axis=0) * second)[:, on]
-    outwards /= np.maximum(_lengths(outwards), 1e-12)
+    outwards /= np.maximum(np.linalg.norm(outwards, axis=0), 1e-12)
     ends, normals = ends[:, on].T, normals[:, on].T
     outwards = _smoothed(ends, outwards.T)
     return Features(_ends(points, ends, normals, outwards), outwards)
-
-
-def _lengths(vectors: Array) -> Array:
-    """Lengths (...,) of vectors (3, ...)."""
-    return np.asarray(np.sqrt((vectors * vectors).sum(axis=0)))
 
 
 def _smoothed(points: Array, outwards: Array) -> Array:
