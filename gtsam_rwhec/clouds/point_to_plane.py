@@ -19,6 +19,9 @@ ALIKE = 0.95
 ASIDE = 0.5
 #: Cauchy's constant, in deviations: 95 % efficiency for Gaussian noise.
 CAUCHY = 2.385
+#: Residuals are this share of the gate at least: points without noise are off by how surfaces bend between them. With
+#: less, points of flat places left no weight to those that tell a pose, and poses stayed where A's noise put them.
+QUIET = 4e-3
 #: What all points of faces, and of edges, are off by together, in their deviations. How far out an edge is seen depends
 #: on how round it is, and how steep it is seen.
 SHARED = (0.2, 0.5)
@@ -97,13 +100,13 @@ def across(points: Array, normals: Array) -> Array:
     return np.stack([y * c - z * b, z * a - x * c, x * b - y * a, a, b, c])
 
 
-def sigmas(several: Sequence[Matches], spacing_m: float) -> Array:
-    """Robust deviations (2,) of the residuals of faces and of edges over several pairs, m."""
+def sigmas(several: Sequence[Matches], gate_m: float) -> Array:
+    """Robust deviations (2,) of the residuals of faces and of edges over several pairs within a gate, m."""
     result = []
     for kind in range(2):
         residuals = np.concatenate([np.zeros(0), *(each.residuals[each.kind == kind] for each in several)])
-        result.append(1.4826 * np.median(np.abs(residuals)) if len(residuals) else spacing_m)
-    return np.maximum(result, 1e-4 * spacing_m)
+        result.append(1.4826 * np.median(np.abs(residuals)) if len(residuals) else gate_m)
+    return np.maximum(result, QUIET * gate_m)
 
 
 def alike(sigma_m: float, noise_m: float) -> float:
