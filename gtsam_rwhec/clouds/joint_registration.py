@@ -165,20 +165,22 @@ def of_groups(poses: Array, i: np.ndarray, j: np.ndarray, information: Array, un
     return np.asarray(unit @ roots @ w * np.sqrt(1.0 / told[loose] - 1.0))
 
 
-def fitted(A: Array, B: Array, covariances: Array, groups: Array, of_A: Array, Y: Array) -> tuple[Array, Array]:
+def fitted(
+    A: Array, B: Array, covariances: Array, groups: Array, of_A: Array, T_frame_sensor: Array, Y: Array
+) -> tuple[Array, Array]:
     """Poses of a thing without the errors that groups of views have together, and how what is left of these moves Y.
 
-    A X exp(x) = Y exp(y) exp(n) B exp(G z + b): n has the variances ``of_A`` (6,), b the covariances of B (N, 6, 6),
-    and z, by which G (N, 6, m) moves the views, 1 each. Least squares has them all, and B exp(G z) is given. At this
-    z, Y lacks of its covariance the squares of its moves (6, 6) by the uncertainty of z.
+    A X exp(x) = Y exp(y) F^-1 exp(n) F B exp(G z + b): n has the variances ``of_A`` (6,) in the frames F (N, 4, 4), b
+    the covariances of B (N, 6, 6), and z, by which G (N, 6, m) moves the views, 1 each. Least squares has them all, and
+    B exp(G z) is given. At this z, Y lacks of its covariance the squares of its moves (6, 6) by z's uncertainty.
     """
     z, X = np.zeros(groups.shape[2]), se3.inverse(A[:1])[0] @ Y @ B[0]
     for _ in range(MOST_STEPS):
         M = B @ se3.expmap(groups @ z)
-        back = se3.adjoint(se3.inverse(M))
+        back, of_n = se3.adjoint(se3.inverse(M)), se3.adjoint(se3.inverse(T_frame_sensor @ M))
         residual = se3.logmap(se3.inverse(M) @ se3.inverse(Y) @ A @ X)
         J = np.concatenate([-back, np.broadcast_to(np.eye(6), back.shape), -groups], axis=2)
-        weighted = np.linalg.solve(covariances + back * of_A @ back.transpose(0, 2, 1), J)
+        weighted = np.linalg.solve(covariances + of_n * of_A @ of_n.transpose(0, 2, 1), J)
         information = np.einsum("nia,nib->ab", J, weighted)
         information[12:, 12:] += np.eye(len(z))
         gradient = np.einsum("nia,ni->a", weighted, residual) + np.r_[np.zeros(12), z]

@@ -191,7 +191,11 @@ def seen_from(views: Views, A: Array, Y: Array) -> SeenObject:
     used = np.setdiff1d(np.arange(len(kept.at)), list(stays))
     B, turn = _about(origin @ se3.pose(np.eye(3), centre), joint)
     covariances = with_common_slides(turn @ joint.alone @ turn.transpose(0, 2, 1))
-    B[used], moves = fitted(kept.A[used], B[used], covariances[used], (turn @ joint.groups)[used], of_A, Y)
+    # A's noise is that of the carrier in whose frame it is less: elsewhere turns at a distance are shifts, too.
+    sides = np.broadcast_to(Y, kept.A.shape), se3.inverse(kept.A) @ Y
+    least, frames = min(((noise_of_A(inside, Y, side), side) for side in sides), key=lambda each: each[0].prod())
+    G = (turn @ joint.groups)[used]
+    B[used], moves = fitted(kept.A[used], B[used], covariances[used], G, least, frames[used], Y)
     poses, of_poses = np.full((len(A), 4, 4), np.nan), np.full((len(A), 6, 6), np.nan)
     poses[kept.at[used]] = B[used]
     of_poses[kept.at[used]] = covariances[used]

@@ -276,12 +276,17 @@ def certified_pose(pairs: Registrations) -> tuple[Array, bool]:
     return _by_motions(pairs, noise_of_A(pairs, _by_motions(pairs, np.zeros(6))[0]))
 
 
-def noise_of_A(pairs: Registrations, Y: Array) -> Array:
-    """The variances (6,) of A, the same along all axes: what motions are off where a pair knows most."""
+def noise_of_A(pairs: Registrations, Y: Array, T_frame_sensor: Array | None = None) -> Array:
+    """The variances (6,) of A, the same along all axes: what motions are off where a pair knows most.
+
+    It has the axes and origins of ``T_frame_sensor`` (N, 4, 4) of each view, or the sensor's.
+    """
     off = se3.logmap(se3.inverse(pairs.B) @ se3.inverse(Y) @ pairs.A @ Y)
+    moved = se3.adjoint(np.eye(4)[None] if T_frame_sensor is None else T_frame_sensor[pairs.j])
+    off, covariances = (moved @ off[..., None])[..., 0], moved @ pairs.covariances @ moved.transpose(0, 2, 1)
     result = np.zeros(6)
     for part in (slice(0, 3), slice(3, 6)):
-        best = np.linalg.eigh(pairs.covariances[:, part, part])[1][:, :, 0]
+        best = np.linalg.eigh(covariances[:, part, part])[1][:, :, 0]
         result[part] = np.median(np.einsum("ni,ni->n", best, off[:, part]) ** 2)
     return result
 
