@@ -39,14 +39,16 @@ BUDGET = {
     # errors that last 30; an arm's stated accuracy 80; poses logged late, copies, mounts that slipped 200; LiDARs 20
     # a late clock that is less than sure, scales that run away, drifts that do not pay, regions, short logs 55
     # clouds a sixth faster (components first, solutions kept within a run) 45; drift in short tracks 20
-    "lines": 101_835,
-    "code": 63_635,
+    # whose frame A's noise has where groups of views are placed, clouds without noise, first fits of drifts: 7
+    "lines": 101_842,
+    "code": 63_639,
     # capture has 25 files, and is a package of its own
     "files": 438,
     "packages": 20,
     "names that occur twice": 0,
     # a test of millimetres through the command, and each slipped mount with its own ground: 15
-    "lines of tests and benchmarks": 73_525,
+    # the bound of what faces tell 45, each of three serious errors with its test 35
+    "lines of tests and benchmarks": 73_602,
 }
 NO_CODE = {tokenize.COMMENT, tokenize.NL, tokenize.NEWLINE, tokenize.INDENT, tokenize.DEDENT, tokenize.ENDMARKER}
 

@@ -284,6 +284,9 @@ PAYS, PAYS_UNSEEN = 6.0, 10.0
 ROUGH, NEAR = 1.0, 10.0
 #: Residuals are correlated in time when their lag-1 correlation is beyond this many standard deviations.
 CORRELATED = 2.5
+#: A drift's first fit starts where other noise is this much (logarithm) less than without a drift: noise that already
+#: explains the drift leaves it nothing, and the fit stood still.
+LESS = 1.0
 
 
 def with_drift(task: Task, steady: Settled, tell: Progress) -> Settled:
@@ -306,11 +309,13 @@ def with_drift(task: Task, steady: Settled, tell: Progress) -> Settled:
             tell(f"estimating drift: {name}")
             model, whole = (drifting(each, kind) for each in (thin, steady.model))
             sizes = task.sizes(whole, systematic=systematic)
-            return fitted(model, sizes, start_at(sizes, near), enough=enough)
+            less = LESS * np.isin(sizes.active, near.sizes.active) if near is steady.fit else 0.0
+            return fitted(model, sizes, start_at(sizes, near) - less, enough=enough)
 
         rough = [(kind, fit(kind, near, ROUGH)) for kind in kinds]
-        most = min(map(_height, rough)) + NEAR
-        return min(((kind, fit(kind, one, ENOUGH)) for kind, one in rough if _height((kind, one)) <= most), key=_height)
+        most = min(one.objective for _, one in rough) + NEAR
+        whole = ((kind, fit(kind, one, ENOUGH)) for kind, one in rough if one.objective <= most)
+        return min(whole, key=lambda tried: tried[1].objective)
 
     kinds = kinds_of(task, steady)
     if not kinds:
@@ -318,7 +323,7 @@ def with_drift(task: Task, steady: Settled, tell: Progress) -> Settled:
     kind, walk = best_of(kinds, steady.fit)
     if kind.correlation < 1.0:
         more = best_of([Walk(each, kind.frame) for each in MORE_CORRELATIONS], walk)
-        kind, walk = min((kind, walk), more, key=_height)
+        kind, walk = min((kind, walk), more, key=lambda tried: tried[1].objective)
     enough = steady.fit.objective - (PAYS if is_correlated(steady) else PAYS_UNSEEN)
     if options.drift == "auto" and walk.objective > enough:
         return steady
@@ -357,12 +362,6 @@ def why_no_drift(task: Task) -> str:
 def is_short(task: Task, than: int = SHORT_TRACK) -> bool:
     """Whether tracks have fewer instants than that."""
     return task.instants.count < than * len(task.data) / task.instants.chains
-
-
-def _height(tried: tuple[Walk, Fitted]) -> float:
-    """-2 log of the density; more for a random walk, which says that the first instant has no error."""
-    kind, fit = tried
-    return fit.objective + (PAYS if kind.correlation == 1.0 else 0.0)
 
 
 def is_correlated(found: Settled) -> bool:

@@ -95,6 +95,22 @@ def test_a_short_log_whose_errors_drift_asks_for_care(walk: tuple[float, float])
     assert calibration.contains("board", X, 0.95)
 
 
+@pytest.mark.parametrize("seed", [0, 10])
+def test_an_odometry_is_a_random_walk_though_fading_errors_fit_it_nearly_as_well(seed: int) -> None:
+    """The map was USE at chi2 56, and at 144 with care: a walk had to be better by 6, and its first fit stood still."""
+    chance = np.random.default_rng(seed)
+    at = np.linspace(0.0, 6.0, 40)[:, None] * chance.uniform(0.6, 3.0, 6) + chance.uniform(0.0, 6.0, 6)
+    A = se3.expmap(np.sin(at) * np.repeat([0.7, 0.4], 3))
+    exact = np.linalg.inv(np.linalg.inv(Y) @ A @ X)
+    steps = np.linalg.inv(exact[:-1]) @ exact[1:] @ twists(chance, 39, 0.002, 0.002)
+    seen = np.array(list(accumulate([exact[0], *steps], np.matmul)))
+    problem = rw.Problem()
+    B = np.linalg.inv(seen) @ twists(chance, 40, 0.001, 0.001)
+    problem.add("map", "camera", A, B, stamps_ns=np.arange(40) * 10**8)
+    calibration = rw.calibrate(problem)
+    assert calibration.contains("map", X, 0.99)
+
+
 def test_a_scale_that_runs_away_under_the_noise_is_not_told() -> None:
     """A camera turns and hardly moves, and its odometry drifts: the scale fell to 2e-5; it was 1e-11 on another log."""
     chance = np.random.default_rng(4)
