@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, fields, replace
+from itertools import count
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -97,8 +98,12 @@ class Cloud:
         """The clouds that a caller gave; arrays of points (N, 3) are clouds too. A CloudError names what is none."""
         if isinstance(given, Cloud | str) or not isinstance(given, Iterable):
             raise CloudError(f"clouds are {brief(given)}; give a list of Cloud, one for each view")
-        for number, one in enumerate(given):
-            yield one if isinstance(one, Cloud) else Cloud.of(one, source=f"clouds[{number}]")
+
+        def named(number: int, one: Cloud | ArrayLike) -> Cloud:
+            return one if isinstance(one, Cloud) else Cloud.of(one, source=f"clouds[{number}]")
+
+        # Unlike a loop, a map does not hold a cloud until the next is read.
+        yield from map(named, count(), given)
 
     def selected(self, mask: np.ndarray) -> Cloud:
         """The points where ``mask`` (N,) is true, or those at an array of places."""

@@ -178,10 +178,12 @@ def prepared(clouds: Iterable[Cloud], A: PosesLike, options: ObjectOptions) -> V
     spacing = spacing_of([each.points for each in first], count) if count else Spacing(0.0, 0.0, 0.0)
     if options.spacing_m is not None:
         spacing = Spacing(options.spacing_m, spacing.edges_m and options.spacing_m / FINER, spacing.noise_m)
-    surfaces, marks = [], []
-    for view, cloud in enumerate(chain(first, given)):
-        surfaces.append(surface_of(cloud, cloud.source or f"clouds[{view}]", spacing))
+    surfaces: list[Surface] = []
+    marks: list[Array] = []
+    for cloud in chain(first, given):
+        surfaces.append(surface_of(cloud, cloud.source or f"clouds[{len(surfaces)}]", spacing))
         marks.append(_mark(reachable(cloud.points)))
+        del cloud  # before the next is read: what is kept of that one would lie in this one's room
     if len(surfaces) != len(transforms):
         raise CloudError(f"{len(surfaces)} clouds and {len(transforms)} poses in A; give one A for each cloud")
     if len(transforms) > 1 and np.abs(se3.logmap(se3.inverse(transforms[:1]) @ transforms[1:])).max() < SAME:
@@ -199,8 +201,8 @@ def prepared(clouds: Iterable[Cloud], A: PosesLike, options: ObjectOptions) -> V
 
 def _mark(points: Array) -> Array:
     """By which points (N, 3) are known in any order: their number, size, means and deviations, (8,)."""
-    scale = np.sqrt(len(points) / (points**2).sum(axis=1).mean())
-    size, mean, off = np.sqrt(points.var(axis=0).sum()), points.mean(axis=0), points.std(axis=0)
+    mean, off = points.mean(axis=0), points.std(axis=0)
+    size, scale = np.linalg.norm(off), np.sqrt(len(points) / (mean @ mean + off @ off))
     return np.asarray(np.r_[len(points), size, scale * mean, scale * off])
 
 
