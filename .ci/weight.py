@@ -39,7 +39,8 @@ BUDGET = {
     # errors that last 30; an arm's stated accuracy 80; poses logged late, copies, mounts that slipped 200; LiDARs 20
     # a late clock that is less than sure, scales that run away, drifts that do not pay, regions, short logs 55
     # clouds a sixth faster (components first, solutions kept within a run) 45; drift in short tracks 20
-    # whose frame A's noise has where groups of views are placed, clouds without noise, first fits of drifts, memory of many clouds: 14
+    # whose frame A's noise has where groups of views are placed, clouds without noise, drifts'
+    # first fits, memory of many clouds: 14
     "lines": 101_849,
     "code": 63_642,
     # capture has 25 files, and is a package of its own
