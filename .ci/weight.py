@@ -40,16 +40,16 @@ BUDGET = {
     # a late clock that is less than sure, scales that run away, drifts that do not pay, regions, short logs 55
     # clouds a sixth faster (components first, solutions kept within a run) 45; drift in short tracks 20
     # whose frame A's noise has where groups of views are placed, clouds without noise, drifts'
-    # first fits, memory of many clouds: 14
-    "lines": 101_849,
-    "code": 63_642,
+    # first fits, memory of many clouds, what a simulated thing is: 15
+    "lines": 101_850,
+    "code": 63_643,
     # capture has 25 files, and is a package of its own
     "files": 438,
     "packages": 20,
     "names that occur twice": 0,
     # a test of millimetres through the command, and each slipped mount with its own ground: 15
-    # the bound of what faces tell 45, each of three serious errors with its test 35
-    "lines of tests and benchmarks": 73_602,
+    # the bounds of what faces tell and of views known exactly 55, three serious errors with their tests 30
+    "lines of tests and benchmarks": 73_607,
 }
 NO_CODE = {tokenize.COMMENT, tokenize.NL, tokenize.NEWLINE, tokenize.INDENT, tokenize.DEDENT, tokenize.ENDMARKER}
 

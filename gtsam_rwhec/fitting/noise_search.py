@@ -301,18 +301,18 @@ def with_drift(task: Task, steady: Settled, tell: Progress) -> Settled:
         )
     thin, systematic = thinned(steady.model), options.systematic
 
-    def best_of(kinds: Sequence[Walk], near: Fitted) -> tuple[Walk, Fitted]:
+    def best_of(kinds: Sequence[Walk], near: Fitted, less: float = 0.0) -> tuple[Walk, Fitted]:
         """A rough fit of each kind, and a whole one of those that are near the best."""
 
-        def fit(kind: Walk, near: Fitted, enough: float) -> Fitted:
+        def fit(kind: Walk, near: Fitted, enough: float, less: float = 0.0) -> Fitted:
             name = "a random walk" if kind.correlation == 1.0 else f"correlation {kind.correlation:g}"
             tell(f"estimating drift: {name}")
             model, whole = (drifting(each, kind) for each in (thin, steady.model))
             sizes = task.sizes(whole, systematic=systematic)
-            less = LESS * np.isin(sizes.active, near.sizes.active) if near is steady.fit else 0.0
-            return fitted(model, sizes, start_at(sizes, near) - less, enough=enough)
+            start = start_at(sizes, near) - less * np.isin(sizes.active, near.sizes.active)
+            return fitted(model, sizes, start, enough=enough)
 
-        rough = [(kind, fit(kind, near, ROUGH)) for kind in kinds]
+        rough = [(kind, fit(kind, near, ROUGH, less)) for kind in kinds]
         most = min(one.objective for _, one in rough) + NEAR
         whole = ((kind, fit(kind, one, ENOUGH)) for kind, one in rough if one.objective <= most)
         return min(whole, key=lambda tried: tried[1].objective)
@@ -320,7 +320,7 @@ def with_drift(task: Task, steady: Settled, tell: Progress) -> Settled:
     kinds = kinds_of(task, steady)
     if not kinds:
         return steady
-    kind, walk = best_of(kinds, steady.fit)
+    kind, walk = best_of(kinds, steady.fit, LESS)
     if kind.correlation < 1.0:
         more = best_of([Walk(each, kind.frame) for each in MORE_CORRELATIONS], walk)
         kind, walk = min((kind, walk), more, key=lambda tried: tried[1].objective)

@@ -112,6 +112,7 @@ class SimulatedClouds:
     T_sensorcarrier_sensor: Array
     T_targetcarrier_object: Array
     T_sensor_object: Array
+    distance: Distance  #: Of points (n, 3) in the thing's own frame, m
 
 
 def clouds_of_thing(
@@ -152,4 +153,4 @@ def clouds_of_thing(
     A = Y @ se3.inverse(T_object_sensor) @ se3.inverse(X)
     seen = (seen_points(distance, T, noise_m, points) for T in T_object_sensor)
     clouds = [Cloud.of(each, source=f"{shape} {k}") for k, each in enumerate(seen)]
-    return SimulatedClouds(clouds, perturb(A, noise_in_A, arm), Y, X, se3.inverse(T_object_sensor))
+    return SimulatedClouds(clouds, perturb(A, noise_in_A, arm), Y, X, se3.inverse(T_object_sensor), distance)
