@@ -48,8 +48,8 @@ BUDGET = {
     "packages": 20,
     "names that occur twice": 0,
     # a test of millimetres through the command, and each slipped mount with its own ground: 15
-    # the bounds of what faces tell and of views known exactly 55, three serious errors with their tests 30
-    "lines of tests and benchmarks": 73_607,
+    # the bounds of what faces tell and of views known exactly 55, four errors with their tests 33
+    "lines of tests and benchmarks": 73_610,
 }
 NO_CODE = {tokenize.COMMENT, tokenize.NL, tokenize.NEWLINE, tokenize.INDENT, tokenize.DEDENT, tokenize.ENDMARKER}
 

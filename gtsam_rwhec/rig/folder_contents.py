@@ -281,7 +281,7 @@ def cloud_folders(folder: Path) -> list[CloudFolder]:
                 assert size is not None
                 intrinsics = _intrinsics(folder, Path(place), size, list(_image_folders(folder)))
                 found.append(CloudFolder(path, files, None, size, *intrinsics))
-            elif (cloud := readable_cloud(files[0])) is not None:
+            elif (cloud := next(filter(None, map(readable_cloud, files)), None)) is not None:
                 is_far = float(np.median(np.linalg.norm(cloud.points, axis=1))) > FAR_UNITS
                 found.append(CloudFolder(path, files, 1e-3 if is_far else None))
     return sorted(found, key=lambda each: natural_key(each.path))

@@ -216,6 +216,9 @@ def test_bad_clouds_are_named_and_the_others_used(folder: Path, made: SimulatedC
     (bad / "clouds" / "view4.npy").write_bytes(b"")
     np.save(bad / "clouds" / "view6.npy", np.full((100, 3), np.nan))
     np.save(bad / "clouds" / "view9.npy", np.zeros((10**6, 3), np.float32))
+    (bad / "clouds" / "view0.npy").write_bytes((folder / "clouds" / "view3.npy").read_bytes()[:200])  # the first is cut
+    assert [each.path for each in cloud_folders(bad)] == ["clouds"]
+    (bad / "clouds" / "view0.npy").unlink()
     said = run("calibrate", bad, "--rig", bad / "rig.yaml", "-o", tmp_path / "out")
     assert "view4.npy is empty" in said
     assert "view6.npy: of 100 points none is seen" in said
